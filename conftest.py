@@ -14,8 +14,8 @@ from hypothesis import settings
 import shape_checks
 
 if TYPE_CHECKING:
-    from cuspid.jaw import Jaw
-    from cuspid.mesh import Mesh
+    from cuspid.model.jaw import Jaw
+    from cuspid.model.mesh import Mesh
 
 # Machines differ in speed, and a test says nothing about it.
 settings.register_profile("cuspid", deadline=None)

@@ -19,9 +19,9 @@ from run import conditions
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
-from cuspid.jaw import Jaw
-from cuspid.pipeline import SimulationOptions
-from cuspid.rig import Handpiece
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece
+from cuspid.pipeline.scan import SimulationOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import read_handpiece, write_json
 from cuspid.studies.grid import Case, Value, run_grid

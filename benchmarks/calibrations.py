@@ -25,15 +25,15 @@ from run import conditions
 from scipy.spatial.transform import Rotation
 
 from cuspid import storage
-from cuspid.board import Board
 from cuspid.calibration.bundle import BoardScene, common_free
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.lenses import choose_lens
-from cuspid.camera import Camera
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.image_files import read_image
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
+from cuspid.runtime.errors import ReconstructionError
+from cuspid.runtime.image_files import read_image
 from cuspid.storage import write_json
 from cuspid.studies.grid import Value
 

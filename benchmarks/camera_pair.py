@@ -21,8 +21,8 @@ from run import conditions
 
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.jaw import Jaw
-from cuspid.reporting.figures.precision import Panel, save_best_picture, save_maps_picture, save_noise_picture
+from cuspid.model.jaw import Jaw
+from cuspid.report.figures.precision import Panel, save_best_picture, save_maps_picture, save_noise_picture
 from cuspid.storage import write_json
 from cuspid.studies.camera_pair import (
     MATCHING,

@@ -19,7 +19,7 @@ from run import conditions, run_timed
 
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.jaw import Jaw
+from cuspid.model.jaw import Jaw
 from cuspid.storage import read_json, write_json
 from cuspid.studies.camera_pair import CameraPairOptions, Row, Term, best_pairs, study_camera_pair
 from cuspid.studies.camera_sweep import SweepOptions

@@ -25,10 +25,10 @@ from real_runs import told
 from run import conditions
 
 from cuspid.anatomy.jaw_files import load_jaw
-from cuspid.board import Board
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.rig import Sensor
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Sensor
 from cuspid.storage import write_jaw, write_json, write_poses
 from cuspid.storage.files import whole_file
 from cuspid.storage.handpieces import camera_to_json, rigid_to_json

@@ -13,12 +13,12 @@ from real_judging import found_poses, mesh_of
 from real_measures import pose_difference
 
 from cuspid.anatomy.crowns import crowns_of
-from cuspid.camera import Camera
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, best_scale, refine
 from cuspid.geometry import Rigid3, best_similarity
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.camera import Camera
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
 from cuspid.storage import read_jaw, read_json, read_poses
 from cuspid.storage.handpieces import camera_from_json
 

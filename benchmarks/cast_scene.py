@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from cuspid.board import Board
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3, unit
-from cuspid.kernels import kernel
-from cuspid.mesh import Mesh
-from cuspid.rig import Sensor
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Sensor
+from cuspid.runtime.kernels import kernel
 from cuspid.simulation.appearance import GRADIENT_NOISE_SD, gradient_noise
 
 PLASTER = (0.72, 0.585, 0.39)

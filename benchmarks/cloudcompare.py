@@ -21,7 +21,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
 from cuspid.storage import write_json
 
 PROGRAMS = ("CloudCompare", "cloudcompare.CloudCompare")

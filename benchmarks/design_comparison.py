@@ -24,7 +24,7 @@ from pathlib import Path
 from run import conditions
 
 from cuspid.cli.comparison import save_pictures
-from cuspid.pipeline import SimulationOptions
+from cuspid.pipeline.scan import SimulationOptions
 from cuspid.storage import write_json
 from cuspid.studies.design_comparison import (
     ComparisonOptions,

@@ -27,9 +27,9 @@ from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
-from cuspid.jaw import Jaw
-from cuspid.pipeline import ReconstructionOptions
-from cuspid.rig import Handpiece, Rig
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece, Rig
+from cuspid.pipeline.scan import ReconstructionOptions
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions

@@ -21,14 +21,14 @@ import numpy as np
 from jaxtyping import Float
 from run import conditions
 
-from cuspid import pipeline
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reconstruction import Expectation, Reconstruction
+from cuspid.model.reconstruction import Expectation, Reconstruction
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import SIGMA, read_json, read_mesh_file, read_poses, read_reconstruction, write_json
 from cuspid.studies.grid import Case, Value, run_grid

@@ -19,9 +19,9 @@ from typing import Any
 from cuspid.storage.code_digest import PACKAGE, Code, meaning
 
 ROOT = Path(__file__).parent.parent
-SHOWN_BY = ("cuspid.reporting", "cuspid.storage.results")
+SHOWN_BY = ("cuspid.report", "cuspid.storage.results")
 """Modules that only show what was made."""
-PLAIN = ("cuspid.stereo.shading", "cuspid.motion.surface_tracking")
+PLAIN = ("cuspid.mvs.shading", "cuspid.motion.icp.surface_tracking")
 """Modules that a scan of a textured surface takes nothing from but options."""
 FOOTAGE = ("cuspid.storage.videos",)
 """Modules that only real footage is read by."""

@@ -22,7 +22,7 @@ from run import conditions
 
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.jaw import Jaw
+from cuspid.model.jaw import Jaw
 from cuspid.storage import write_json
 from cuspid.studies.camera_sweep import SweepOptions, sweep
 

@@ -28,16 +28,16 @@ import trimesh
 from run import conditions
 from scipy.spatial.transform import Rotation
 
-from cuspid import pipeline
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
-from cuspid.jaw import ARCHES, GUM, Arch, Jaw
-from cuspid.mesh import Mesh, edges_of
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.rig import Handpiece
-from cuspid.room import Room
+from cuspid.model.jaw import ARCHES, GUM, Arch, Jaw
+from cuspid.model.mesh import Mesh, edges_of
+from cuspid.model.rig import Handpiece
+from cuspid.model.room import Room
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.storage import read_json, read_poses, write_json
 from cuspid.studies.grid import Case, Value, Work, run_grid

@@ -39,7 +39,7 @@ from cuspid.anatomy.landmarks.scheme import kind_of
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.geometry import best_similarity
-from cuspid.jaw import ARCHES, Arch, Landmark
+from cuspid.model.jaw import ARCHES, Arch, Landmark
 from cuspid.storage import write_json
 from cuspid.storage.jaws import read_labelled_mesh
 

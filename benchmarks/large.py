@@ -29,8 +29,8 @@ from websockets.typing import Origin, Subprotocol
 
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
 from cuspid.storage import write_jaw, write_json, write_mesh
 
 HERE = Path(__file__).parent

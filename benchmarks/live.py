@@ -26,9 +26,9 @@ from jaxtyping import Float, UInt8
 from run import conditions, run_timed
 
 from cuspid import storage
-from cuspid.capture import Capture, ImageSource
 from cuspid.geometry import Rigid3
-from cuspid.session import Session
+from cuspid.model.capture import Capture, ImageSource
+from cuspid.pipeline.session import Session
 from cuspid.storage import write_json
 from cuspid_thesis.scan_cases import ONE_PASS
 
@@ -38,7 +38,7 @@ BLIND = 10
 
 @dataclass(frozen=True)
 class Blinded:
-    """Images of another source, and black ones of further frames. An :class:`cuspid.capture.ImageSource`."""
+    """Images of another source, and black ones of further frames. An :class:`cuspid.model.capture.ImageSource`."""
 
     whole: ImageSource
     black: Mapping[str, str]

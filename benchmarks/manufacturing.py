@@ -25,17 +25,18 @@ from typing import Literal
 import numpy as np
 from run import conditions
 
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.capture import Capture
 from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reconstruction import Reconstruction
-from cuspid.rig import Rig
+from cuspid.model.capture import Capture
+from cuspid.model.reconstruction import Reconstruction
+from cuspid.model.rig import Rig
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import write_json

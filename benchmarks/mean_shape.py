@@ -29,10 +29,10 @@ from cuspid import storage
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape, vertex_areas
 from cuspid.geometry import best_similarity
-from cuspid.jaw import GUM, Jaw, Landmark
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, Jaw, Landmark
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.workers import usable_cores
 from cuspid.storage import read_shape_model, write_shape_model
-from cuspid.workers import usable_cores
 from cuspid_thesis.samples import MEAN_GROUP, iteration, make_phantom, make_population
 
 KNOWN = 6

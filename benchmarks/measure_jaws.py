@@ -33,7 +33,7 @@ from cuspid.anatomy.landmarks.estimation import with_estimates
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS
-from cuspid.jaw import Arch, Jaw
+from cuspid.model.jaw import Arch, Jaw
 
 SEEDS = range(6)
 ARCHES: tuple[Arch, ...] = ("lower", "upper")

@@ -266,10 +266,10 @@ def benchmarks(results: Mapping[str, Result], older: Older) -> str:
         "Conditions of the thesis: texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN in each "
         "colour channel, 120 images for a tooth and 1200 or more for an arch. (`all-round`: 360 for a tooth, with the "
         "further passes that `--passes auto` plans, from the true jaw, where two cameras would see little: as one who "
-        "looks at what is missing and scans it.) Trueness is measured from scan to "
-        "reference, over the surface that at least two cameras of one frame could see (rule: `cuspid.visibility`). "
-        "Times are wall-clock seconds of `cuspid reconstruct` on 2 cores with numba's compiled code cached. Whole "
-        "arches are scanned in one pass (`--passes turns`).",
+        "looks at what is missing and scans it.) Trueness is measured from scan to reference, over the surface that at "
+        "least two cameras of one frame could see (rule: `cuspid.model.visibility`). Times are wall-clock seconds of "
+        "`cuspid reconstruct` on 2 cores with numba's compiled code cached. Whole arches are scanned "
+        "in one pass (`--passes turns`).",
         "",
     ]
     for group in BARS:

@@ -39,8 +39,8 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GroupName, draw_population
 from cuspid.evaluation.panorama import PanoramaEvaluationOptions, TracedPixels, trace_pixels
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh, edges_of
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh, edges_of
 
 PHANTOMS: tuple[tuple[GroupName, int], ...] = (
     ("lower-14", 3),

@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 
 from cuspid import storage
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.reporting.figures.drawing import look, new_figure, render, save_figure
+from cuspid.model.mesh import Mesh
+from cuspid.report.figures.drawing import look, new_figure, render, save_figure
 from cuspid.storage.reconstructions import read_depth_maps, read_reconstruction
 from cuspid.storage.results import ScanResult
 

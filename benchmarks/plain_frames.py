@@ -25,21 +25,21 @@ from jaws import figures_of, parser_of
 from jaxtyping import Float, UInt8
 from run import conditions
 
-from cuspid import pipeline
-from cuspid.capture import Capture
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.motion.surface_tracking import SurfaceTrackingOptions, adjusted
-from cuspid.motion.surfaces import Surface, surface_of
-from cuspid.pairing import rank_sources
-from cuspid.pipeline import SimulationOptions
-from cuspid.progress import silent
-from cuspid.rig import Handpiece
+from cuspid.model.capture import Capture
+from cuspid.model.mesh import Mesh
+from cuspid.model.pairing import rank_sources
+from cuspid.model.rig import Handpiece
+from cuspid.motion.icp.surface_tracking import SurfaceTrackingOptions, adjusted
+from cuspid.motion.icp.surfaces import Surface, surface_of
+from cuspid.mvs.initial_depth import initial_pairs, semi_global
+from cuspid.mvs.matching import DepthEstimator
+from cuspid.mvs.rectification import RectifiedPair, rectify
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import SimulationOptions
+from cuspid.runtime.progress import silent
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions
-from cuspid.stereo.initial_depth import initial_pairs, semi_global
-from cuspid.stereo.matching import DepthEstimator
-from cuspid.stereo.rectification import RectifiedPair, rectify
 from cuspid.storage import read_poses, write_json
 from cuspid.studies.grid import Case, Value
 from cuspid_thesis.scan_cases import commit

@@ -21,7 +21,6 @@ from run import conditions
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.surfaces import named_surfaces
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, twelve_cameras
 from cuspid.handpiece.precision import (
@@ -35,9 +34,10 @@ from cuspid.handpiece.precision import (
     triangulate,
 )
 from cuspid.handpiece.presets import PRESETS
-from cuspid.jaw import Jaw
-from cuspid.reporting.figures.precision import save_ellipsoids_picture, save_precision_picture
-from cuspid.rig import Handpiece, MountedCamera
+from cuspid.model.camera import Camera
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece, MountedCamera
+from cuspid.report.figures.precision import save_ellipsoids_picture, save_precision_picture
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.storage import write_json
 from cuspid.studies.camera_pair import camera_pair

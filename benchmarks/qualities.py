@@ -23,8 +23,8 @@ from typing import get_args
 
 from run import conditions, run_timed, timed
 
-from cuspid.pipeline import Quality
-from cuspid.workers import core_numbers
+from cuspid.pipeline.scan import Quality
+from cuspid.runtime.workers import core_numbers
 from cuspid_thesis.scan_cases import ONE_PASS
 
 HERE = Path(__file__).parent

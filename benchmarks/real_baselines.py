@@ -15,16 +15,16 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
-from cuspid.capture import Capture
+from cuspid.fusion.depth_fusion import FusionOptions, fuse
 from cuspid.geometry import Rigid3
+from cuspid.model.capture import Capture
+from cuspid.model.pairing import detail_mm
+from cuspid.model.reconstruction import DepthMap
+from cuspid.model.rig import Rig
 from cuspid.motion.colmap import quiet
-from cuspid.pairing import detail_mm
-from cuspid.reconstruction import DepthMap
-from cuspid.rig import Rig
-from cuspid.stereo.rectification import RectifiedPair, rectify
+from cuspid.mvs.rectification import RectifiedPair, rectify
 from cuspid.storage import read_capture, write_mesh
 from cuspid.storage.reconstructions import write_depth_maps
-from cuspid.surface.fusion import FusionOptions, fuse
 
 BLOCK_PX = 5
 LEAST_DEG, MOST_DEG = 3.0, 40.0

@@ -21,9 +21,9 @@ from run import conditions
 from scipy.io import loadmat
 
 from cuspid.geometry import unit
-from cuspid.rig import Light
-from cuspid.stereo.glare import STRENGTH, mirrored
-from cuspid.stereo.shading import ShadingOptions, trusted
+from cuspid.model.rig import Light
+from cuspid.mvs.glare import STRENGTH, mirrored
+from cuspid.mvs.shading import ShadingOptions, trusted
 from cuspid.storage import write_json
 
 HERE = Path(__file__).parent

@@ -28,15 +28,15 @@ from real_measures import (
 from real_sets import Set, cameras_of, image_file, mask_file
 from scipy.spatial.transform import Rotation
 
-from cuspid.errors import CuspidError
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
-from cuspid.image_files import read_image
-from cuspid.mesh import Mesh
-from cuspid.reconstruction import DepthMap
-from cuspid.reporting.figures.drawing import render
-from cuspid.rig import Rig
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import DepthMap
+from cuspid.model.rig import Rig
+from cuspid.report.figures.drawing import render
+from cuspid.runtime.errors import CuspidError
+from cuspid.runtime.image_files import read_image
 from cuspid.storage import read_handpiece, read_json, read_mesh_file, read_poses
 from cuspid.storage.reconstructions import read_depth_maps
 

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.geometry import Rigid3, best_similarity
-from cuspid.mesh import Mesh
-from cuspid.reconstruction import DepthMap
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import DepthMap
+from cuspid.model.rig import MountedCamera
 from cuspid.simulation.raycast import render_depth
 
 AGREEING_PX = 1.0

@@ -24,7 +24,6 @@ from calibrations import BOARD, NOISE_PX, SETS, SIZE, lens_z, rig_before_board, 
 from run import conditions
 from scipy.spatial.transform import Rotation
 
-from cuspid import pipeline
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.calibration.bundle import BoardScene
@@ -32,15 +31,16 @@ from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, cal
 from cuspid.calibration.corners import BoardView, Views
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.rig import Handpiece
-from cuspid.shutter import PLAIN, Shutter
+from cuspid.model.rig import Handpiece
+from cuspid.model.shutter import PLAIN, Shutter
+from cuspid.model.tolerances import with_cameras
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import write_json
 from cuspid.storage.files import read_json
 from cuspid.studies.grid import Value
-from cuspid.tolerances import with_cameras
 from cuspid_thesis.scan_cases import commit
 
 HERE = Path(__file__).parent

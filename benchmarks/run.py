@@ -12,7 +12,7 @@ import argparse
 import json
 from pathlib import Path
 
-from cuspid.errors import CuspidError
+from cuspid.runtime.errors import CuspidError
 from cuspid_thesis.scan_cases import conditions, measure_scan, run_timed, scan_cases, timed
 
 __all__ = ["conditions", "run_timed", "timed"]  # Other benchmarks take them from here.

@@ -2,8 +2,8 @@
 
     python benchmarks/staged.py TIMES.json reconstruct CAPTURE --out OUT
 
-Motion times its own stages; of the others, each is a function of :mod:`cuspid.pipeline`. What is left, the start of the
-program, reading and pictures, is told as one. With each goes the peak of memory until its end.
+Motion times its own stages; of the others, each is a function of :mod:`cuspid.pipeline.scan`. What is left, the start
+of the program, reading and pictures, is told as one. With each goes the peak of memory until its end.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ FUNCTIONS = {
 def main() -> None:
     """Run, and write wall seconds and peak memory (GiB, up to its end) of each stage."""
     times, *arguments = sys.argv[1:]
-    from cuspid import pipeline
     from cuspid.__main__ import main as cuspid
+    from cuspid.pipeline import scan as pipeline
 
     stages: dict[str, dict[str, float]] = {}
     for name, stage in FUNCTIONS.items():

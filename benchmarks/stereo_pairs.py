@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from run import conditions
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.rig import Handpiece, MountedCamera, Rig
-from cuspid.stereo import DepthEstimator, StereoOptions
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.mvs import DepthEstimator, StereoOptions
 from cuspid.storage import write_json
 
 Image = UInt8[np.ndarray, "h w 3"]

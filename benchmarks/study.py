@@ -33,13 +33,13 @@ from study_cases import bent, errors, fields, near_curve, signed_twist
 
 from cuspid import storage
 from cuspid.anatomy.orientation import find_occlusal_frame
-from cuspid.arch_curve import arch_curve
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.scan_bodies import fit_body
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.facing import facing_outwards
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
 from cuspid.studies.scanners.files import ScanFile
 from cuspid.studies.scanners.inference import compare_scanners, mean_estimate, precision_estimate
 from cuspid.studies.scanners.scan import StudyOptions, measure_file

@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from cuspid.facing import pieces_of
 from cuspid.geometry import lengths_along
-from cuspid.mesh import Mesh
+from cuspid.model.facing import pieces_of
+from cuspid.model.mesh import Mesh
 
 Points = Float[np.ndarray, "n 3"]
 Field = Callable[[Points], Points]

@@ -21,12 +21,12 @@ import cv2
 import numpy as np
 from run import conditions
 
-from cuspid.board import Board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import Views, find_corners
 from cuspid.handpiece.designs import DesignOptions, six_cameras
-from cuspid.image_files import read_image
-from cuspid.rig import Handpiece, Rig
+from cuspid.model.board import Board
+from cuspid.model.rig import Handpiece, Rig
+from cuspid.runtime.image_files import read_image
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
 from cuspid.storage import write_json

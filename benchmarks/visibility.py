@@ -23,16 +23,16 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece
-from cuspid.storage import write_json
-from cuspid.visibility import (
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
+from cuspid.model.visibility import (
     VisibilityOptions,
     scannable_faces,
     survey_visibility,
     visible_counts,
 )
+from cuspid.storage import write_json
 from cuspid_thesis.samples import path_over, surfaces_seen
 
 EDGE_MM = 0.29

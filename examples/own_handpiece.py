@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from cuspid import storage
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.pairing import stereo_pairs
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.pairing import stereo_pairs
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 folder = Path(sys.argv[1])
 camera = Camera.from_field_of_view(640, 480, 70.0)

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cuspid import storage
-from cuspid.board import Board
 from cuspid.calibration.bundle import BoardScene, bending_coordinates, interpolation
 from cuspid.calibration.corners import BoardView
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
 from cuspid.simulation.board_images import board_light
 from cuspid.simulation.raycast import pixel_rays
 

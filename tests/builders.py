@@ -12,11 +12,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from cuspid import storage
-from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame, ImageFolder
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Capture, Frame, ImageFolder
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 CAMERA = Camera.from_field_of_view(16, 12, 62.0)
 THESIS_CAMERA = Camera.from_field_of_view(500, 500, 62.0)

@@ -29,25 +29,26 @@ from PIL import Image
 
 from boards import photographs, scene, undistorted
 from builders import image_path, write_frames
-from cuspid import cli, pipeline, storage
+from cuspid import cli, storage
 from cuspid.anatomy.jaw_files import Labelling, load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.arch_curve import arch_curve
-from cuspid.board import Board
-from cuspid.errors import CuspidError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.search import SearchOptions
-from cuspid.facing import facing_outwards
 from cuspid.handpiece.brief import read_brief
 from cuspid.handpiece.designs import DESIGNS
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.image_files import image_size, read_fine, read_image
-from cuspid.jaw import Jaw, Landmark
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.board import Board
+from cuspid.model.facing import facing_outwards
+from cuspid.model.jaw import Jaw, Landmark
+from cuspid.model.rig import Rig
 from cuspid.motion.colmap import read_model
-from cuspid.pipeline import RenderOptions, take_images
-from cuspid.rig import Rig
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import RenderOptions, take_images
+from cuspid.runtime.errors import CuspidError
+from cuspid.runtime.image_files import image_size, read_fine, read_image
 from cuspid.studies.scanners.files import find_files
 from cuspid.studies.scanners.specimen import load_specimen
 from report_folders import (

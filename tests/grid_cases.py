@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from cuspid.errors import ReconstructionError
+from cuspid.runtime.errors import ReconstructionError
 from cuspid.studies.grid import Case, run_grid
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
 
 GUM_TOP_MM, BOTTOM_MM = 0.0, -6.0
 

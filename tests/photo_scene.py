@@ -11,9 +11,9 @@ import numpy as np
 from PIL import Image
 
 from boards import looking_at
-from cuspid.board import Board
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
 from synthetic_scene import cast_depth, height_field, textured
 
 BOARD = Board(columns=7, rows=5, square_mm=3.0)

@@ -8,11 +8,11 @@ from functools import cache
 
 import numpy as np
 
-from cuspid.capture import Capture, Frame
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, Light, Lighting, Sensor
+from cuspid.model.capture import Capture, Frame
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, Light, Lighting, Sensor
 from cuspid.simulation.appearance import APPEARANCES
 from cuspid.simulation.raycast import Scene, auto_gain, render_image
 from synthetic_scene import diamond, height_field

@@ -9,17 +9,17 @@ import numpy as np
 
 from builders import folder_capture, image_path
 from cuspid import storage
-from cuspid.camera import Camera
-from cuspid.capture import Dropped
 from cuspid.evaluation.deviation import statistics
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.reconstruction import Reconstruction
-from cuspid.reporting.figures.drawing import deviation_colors
-from cuspid.rig import Handpiece, Lighting, MountedCamera, Rig
-from cuspid.shape_model import MeanStep, ShapeModel
-from cuspid.trueness import CrownCompleteness, Trueness
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Dropped
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import Reconstruction
+from cuspid.model.rig import Handpiece, Lighting, MountedCamera, Rig
+from cuspid.model.shape_model import MeanStep, ShapeModel
+from cuspid.model.trueness import CrownCompleteness, Trueness
+from cuspid.report.figures.drawing import deviation_colors
 
 TOOTH = 46
 BUMP_UM = 80.0

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import MODELS
+from cuspid.model.camera import Camera
 
 
 def vectors(limit: float = 10.0, size: int = 3) -> st.SearchStrategy[np.ndarray]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.reconstruction import DepthMap
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import DepthMap
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
 
 DIAMOND_MM = {"west": (-1.25, 0.0), "east": (1.25, 0.0), "north": (0.0, -0.75), "south": (0.0, 0.75)}
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from cuspid.geometry import Rigid3
-from cuspid.pairing import PairingOptions
-from cuspid.rig import Handpiece, Rig, Sensor
-from cuspid.stereo.across import AcrossOptions, measure_moving_cameras, moving_pair
-from cuspid.stereo.matching import StereoOptions
+from cuspid.model.pairing import PairingOptions
+from cuspid.model.rig import Handpiece, Rig, Sensor
+from cuspid.mvs.across import AcrossOptions, measure_moving_cameras, moving_pair
+from cuspid.mvs.matching import StereoOptions
 from synthetic_scene import cast_depth, diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))

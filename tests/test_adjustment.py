@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from cuspid.camera import Camera
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import LENSES, MODELS
-from cuspid.motion import adjustment, gauge, normal_equations
-from cuspid.motion.adjustment import AdjustmentOptions, adjust, left_jacobian
-from cuspid.motion.expectation import covariance_factor
-from cuspid.reconstruction import Reconstruction, Tracks, chosen_tracks
-from cuspid.rig import MountedCamera, Rig
-from cuspid.shutter import Shutter
+from cuspid.model.camera import Camera
+from cuspid.model.reconstruction import Reconstruction, Tracks, chosen_tracks
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.model.shutter import Shutter
+from cuspid.motion.bundle import adjustment, gauge, normal_equations
+from cuspid.motion.bundle.adjustment import AdjustmentOptions, adjust, left_jacobian
+from cuspid.motion.bundle.expectation import covariance_factor
+from cuspid.runtime.errors import ReconstructionError
 
 SIGMA_PX = 0.3
 EXTRINSIC_SIGMA = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02])

@@ -14,20 +14,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuspid import pipeline
-from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame
+from cuspid.fusion.depth_fusion import FusionOptions
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Capture, Frame
+from cuspid.model.mesh import Mesh
+from cuspid.model.pairing import detail_mm, resolved_mm
+from cuspid.model.reconstruction import DepthMap, Reconstruction
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.tolerances import EXACT
 from cuspid.motion import MotionOptions, locate
-from cuspid.pairing import detail_mm, resolved_mm
-from cuspid.pipeline import ReconstructionOptions
-from cuspid.reconstruction import DepthMap, Reconstruction
-from cuspid.rig import Handpiece, MountedCamera, Rig
-from cuspid.stereo import DepthEstimator, StereoOptions
-from cuspid.stereo.across import AcrossOptions
-from cuspid.surface.fusion import FusionOptions
-from cuspid.tolerances import EXACT
+from cuspid.mvs import DepthEstimator, StereoOptions
+from cuspid.mvs.across import AcrossOptions
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions
 from synthetic_scene import DIAMOND_MM, diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y), half_width_mm=5.0)
@@ -42,7 +42,7 @@ Images = Mapping[tuple[str, str], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class InMemory:
-    """Images by (frame, camera). An :class:`cuspid.capture.ImageSource`."""
+    """Images by (frame, camera). An :class:`cuspid.model.capture.ImageSource`."""
 
     images: Images
     suffix: str = ".png"

@@ -19,9 +19,9 @@ from cuspid.anatomy.landmarks.dimensions import (
     survey,
 )
 from cuspid.anatomy.landmarks.scheme import in_frame, labels_of
-from cuspid.errors import InputError
-from cuspid.jaw import Arch, Jaw, Landmark
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Arch, Jaw, Landmark
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from strategies import rigid3s
 
 TRUTH = {"a": 27.0, "b": 51.0, "c": 56.0, "f": 33.0, "f_first": 21.0}

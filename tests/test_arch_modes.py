@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuspid.arch_curve import arch_curve
-from cuspid.errors import InputError
 from cuspid.evaluation.deformation import MODES, fit_deformation, mode_fields
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import scatter
@@ -15,7 +13,9 @@ from cuspid.evaluation.registration import RegistrationOptions, located, refine
 from cuspid.evaluation.scan_bodies import fit_body
 from cuspid.evaluation.spans import Station, slope_ppm, spans
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from horseshoe import horseshoe
 
 SECOND_ORDER = {"scale": 25.0, "spread": 4.0, "lift": 4.0, "twist": 4.0}

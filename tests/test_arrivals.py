@@ -9,8 +9,8 @@ import pytest
 
 from builders import handpiece
 from cuspid import storage
-from cuspid.errors import InputError
 from cuspid.footage.arrivals import Arrivals
+from cuspid.runtime.errors import InputError
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-REFINEMENT = "src/cuspid/stereo/refinement.py"
+REFINEMENT = "src/cuspid/mvs/refinement.py"
 
 
 @pytest.fixture
@@ -62,10 +62,10 @@ def test_what_is_only_read_changes_no_result(freshness, repository, text):
 @pytest.mark.long
 def test_a_module_that_is_moved_changes_no_result(freshness, repository):
     """Its folder, its name and all that import it."""
-    moved = repository / "src/cuspid/stereo/depth_refinement.py"
+    moved = repository / "src/cuspid/mvs/depth_refinement.py"
     (repository / REFINEMENT).rename(moved)
     for path in [*repository.rglob("*.py")]:
-        path.write_text(path.read_text().replace("cuspid.stereo.refinement", "cuspid.stereo.depth_refinement"))
+        path.write_text(path.read_text().replace("cuspid.mvs.refinement", "cuspid.mvs.depth_refinement"))
     result = {"commit": commit_of(repository)}
     assert freshness.changes("measure", result) == ()
     assert freshness.changes("stereo_pairs", result) == ()
@@ -91,15 +91,15 @@ def test_a_change_ends_what_it_made_and_nothing_else(freshness, repository):
 
 
 def test_what_only_plain_surfaces_need_ends_only_their_results(freshness, repository):
-    add(repository, "src/cuspid/stereo/glare.py", "\nNEW = 1\n")
+    add(repository, "src/cuspid/mvs/glare.py", "\nNEW = 1\n")
     result = {"commit": commit_of(repository)}
-    assert freshness.changes("enamel", result) == freshness.changes("fuzz", result) == ("src/cuspid/stereo/glare.py",)
+    assert freshness.changes("enamel", result) == freshness.changes("fuzz", result) == ("src/cuspid/mvs/glare.py",)
     for name in ("jaws_half", "molar-seed0", "stereo_pairs"):
         assert freshness.changes(name, result) == ()
 
 
 def test_pictures_and_pages_are_no_part_of_figures(freshness, repository):
-    add(repository, "src/cuspid/reporting/figures/drawing.py", "\nNEW = 1\n")
+    add(repository, "src/cuspid/report/figures/drawing.py", "\nNEW = 1\n")
     add(repository, "benchmarks/page.py", "\nNEW = 1\n")
     assert freshness.changes("molar-seed0", {"commit": commit_of(repository)}) == ()
 

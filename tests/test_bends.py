@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from builders import box_mesh, plate, sphere
-from cuspid.mesh import Mesh, edges_of
-from cuspid.surface.bends import bent, halved
+from cuspid.fusion.bends import bent, halved
+from cuspid.model.mesh import Mesh, edges_of
 
 
 @settings(max_examples=30, deadline=None)

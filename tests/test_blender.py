@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from cuspid.camera import Camera
-from cuspid.capture import Frame
-from cuspid.errors import CuspidError, InputError, MissingDependencyError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Frame
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
+from cuspid.runtime.errors import CuspidError, InputError, MissingDependencyError
 from cuspid.simulation import blender, raycast
 from cuspid.simulation.appearance import APPEARANCES, Appearance, Material
 from cuspid.simulation.optics import CLINICAL

@@ -12,15 +12,15 @@ import pytest
 
 from boards import SIZE, options, photograph, pose_before, scene, undistorted
 from cuspid import storage
-from cuspid.board import Board
-from cuspid.board.circles import turned_orders
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.calibrate import CalibrationOptions, _calibrate_once, calibrate_rig
 from cuspid.calibration.circle_centres import centre_shifts, measured_share
 from cuspid.calibration.corners import BoardView, find_corners
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.model.board import Board
+from cuspid.model.board.circles import turned_orders
+from cuspid.model.camera import Camera
+from cuspid.runtime.errors import InputError
 from verbs import run
 
 TAGS = Board(kind="aprilgrid", columns=4, rows=3, square_mm=3.0, first_id=20)

@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from cuspid.anatomy.shape.boxed import BoxOptions, boxed, crown_boxes
-from cuspid.errors import InputError
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import pytest
 
 from boards import BOARD, SIZE, moving, moving_pose, options, photographs, rolling_views, scene, undistorted, views_of
 from cuspid import storage
-from cuspid.board import Board
 from cuspid.calibration import bundle, calibrate
 from cuspid.calibration.board_shape import BoardShape
 from cuspid.calibration.bundle import BoardScene, adjust_board
@@ -16,11 +15,12 @@ from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, cal
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.start import board_pose, first_camera
 from cuspid.calibration.timing import rolling, untied
-from cuspid.camera import Camera
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.rig import Rig
-from cuspid.shutter import PLAIN, frame_numbers
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Rig
+from cuspid.model.shutter import PLAIN, frame_numbers
+from cuspid.runtime.errors import InputError, ReconstructionError
 from verbs import refused, run
 
 CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)

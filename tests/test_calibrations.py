@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cuspid import storage
-from cuspid.camera import Camera
-from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.runtime.errors import CuspidError, InputError, OutputError
 from cuspid.storage.calibrations import FORMATS, carried_over, read_calibration, write_calibration
 from verbs import refused, run
 

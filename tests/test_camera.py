@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera, project_orthographic
-from cuspid.errors import InputError
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera, project_orthographic
+from cuspid.runtime.errors import InputError
 from strategies import cameras
 
 

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera, undistortion_maps
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import LENSES, MODELS, fold_radius, projection_derivatives
-from cuspid.rig import MountedCamera, Rig
+from cuspid.model.camera import Camera, undistortion_maps
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.runtime.errors import InputError
 from strategies import LENS_LIMITS, lenses
 
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
-from cuspid.jaw import Jaw
+from cuspid.model.camera import Camera
+from cuspid.model.jaw import Jaw
+from cuspid.runtime.errors import InputError
 from cuspid.studies.camera_pair import (
     CameraPairOptions,
     best_pairs,

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cuspid import cli, storage
-from cuspid.errors import InputError
-from cuspid.pairing import stereo_pairs
-from cuspid.room import Room
+from cuspid.model.pairing import stereo_pairs
+from cuspid.model.room import Room
+from cuspid.runtime.errors import InputError
 from cuspid.studies import camera_sweep, grid
 from cuspid.studies.camera_sweep import (
     SweepOptions,

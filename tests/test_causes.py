@@ -13,18 +13,18 @@ from PIL import Image
 from boards import photograph, photographs, pose_before, scene, undistorted
 from builders import rig_of, shifted
 from cuspid import storage
-from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration import corners
 from cuspid.calibration.calibrate import size_notes
 from cuspid.calibration.causes import cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.from_images import _matched
 from cuspid.calibration.instants import common_instants
-from cuspid.camera import Camera
-from cuspid.errors import InputError
-from cuspid.image_files import exif_orientation, read_image, recorded
-from cuspid.image_sequence import ImageSequence
-from cuspid.rig import Rig
+from cuspid.model.board import Board, BoardSet, Target
+from cuspid.model.camera import Camera
+from cuspid.model.image_sequence import ImageSequence
+from cuspid.model.rig import Rig
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import exif_orientation, read_image, recorded
 from verbs import refused, run
 
 BOARD = Board(columns=7, rows=6, square_mm=2.5)

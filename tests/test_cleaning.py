@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from builders import joined, moved, sphere
-from cuspid.mesh import Mesh
-from cuspid.surface.cleaning import CleaningReport, boundaries, non_manifold_faces
-from cuspid.surface.cleaning import clean as clean_mesh
+from cuspid.fusion.cleaning import CleaningReport, boundaries, non_manifold_faces
+from cuspid.fusion.cleaning import clean as clean_mesh
+from cuspid.model.mesh import Mesh
 from synthetic_scene import height_field
 
 SHEET = height_field(lambda x, y: 5 + 0.2 * np.sin(x), half_width_mm=2.0, count=41)

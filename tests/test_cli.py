@@ -13,9 +13,9 @@ from builders import box_mesh, handpiece, image_path, make_capture, shifted, sph
 from cuspid import __version__, cli, storage
 from cuspid.cli.scan import _evaluate_trajectory
 from cuspid.cli.shared import Probe, load_probe, suited
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from report_folders import known_trueness
 from verbs import refused, run
 

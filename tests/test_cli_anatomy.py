@@ -8,8 +8,8 @@ import pytest
 
 from cuspid import storage
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.jaw import Jaw, Landmark
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Jaw, Landmark
+from cuspid.model.mesh import Mesh
 from verbs import refused, run
 
 

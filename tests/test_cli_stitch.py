@@ -10,7 +10,7 @@ import pytest
 
 from builders import write_frames
 from cuspid import storage
-from cuspid.camera import Camera
+from cuspid.model.camera import Camera
 from cuspid.storage.handpieces import camera_to_json
 from verbs import refused
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from cuspid.geometry import Rigid3
+from cuspid.model.reconstruction import Tracks
+from cuspid.model.rig import Handpiece, Rig
 from cuspid.motion import MotionOptions, location
-from cuspid.motion.closure import closing_pairs
+from cuspid.motion.frontend.closure import closing_pairs
 from cuspid.motion.location import locate_features
-from cuspid.reconstruction import Tracks
-from cuspid.rig import Handpiece, Rig
 from test_odometry import errors, make_handpiece, see, wrongly_calibrated
 
 OUT, STEP_MM = 13, 1.2

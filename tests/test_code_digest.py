@@ -120,7 +120,7 @@ def read(module: str) -> bytes | None:
     return file.read_bytes() if module.startswith("cuspid.") and file.is_file() else None
 
 
-FEATURES = "cuspid.motion.features"
+FEATURES = "cuspid.motion.frontend.features"
 
 
 def test_features_that_were_found_outlive_comments_and_a_move() -> None:

@@ -11,14 +11,14 @@ import pycolmap
 import pytest
 
 from builders import folder_capture, image_path, mottled
-from cuspid.camera import Camera
-from cuspid.capture import Capture
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.motion.adjustment import residuals_px
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Capture
+from cuspid.model.reconstruction import Reconstruction, Tracks
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.motion.bundle.adjustment import residuals_px
 from cuspid.motion.colmap import locate_with_colmap, read_model, write_model
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.runtime.errors import InputError, ReconstructionError
 
 
 def make_rig() -> Rig:

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuspid.arch_curve import ArchCurve, arch_curve
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four
 from cuspid.handpiece.intra_oral import intra_oral_camera
-from cuspid.jaw import Jaw
-from cuspid.room import Room, room_about
+from cuspid.model.arch_curve import ArchCurve, arch_curve
+from cuspid.model.jaw import Jaw
+from cuspid.model.room import Room, room_about
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.cross import Crossing, plan_crossing
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path

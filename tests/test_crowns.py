@@ -6,14 +6,14 @@ import pytest
 import trimesh
 
 from builders import any_pose, plate
-from cuspid import pipeline
 from cuspid.anatomy.crowns import crowns_by_shape, crowns_of
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.evaluation.deviation import evaluate
-from cuspid.jaw import Arch, Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Arch, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.pipeline import scan as pipeline
 
 
 @cache

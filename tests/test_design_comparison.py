@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from cuspid import storage
 from cuspid.cli import main
-from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, essential_four, six_cameras, twelve_cameras
-from cuspid.mesh import Mesh
-from cuspid.pipeline import SimulationOptions
+from cuspid.model.mesh import Mesh
+from cuspid.pipeline.scan import SimulationOptions
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.studies.design_comparison import (
     ComparisonOptions,

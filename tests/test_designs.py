@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.errors import InputError
 from cuspid.handpiece.designs import DESIGNS, DesignOptions, essential_four, six_cameras, stereo_pair, twelve_cameras
-from cuspid.pairing import camera_groups, stereo_pairs
-from cuspid.rig import Handpiece
+from cuspid.model.pairing import camera_groups, stereo_pairs
+from cuspid.model.rig import Handpiece
+from cuspid.runtime.errors import InputError
 
 OPTIONS = st.builds(
     DesignOptions,

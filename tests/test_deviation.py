@@ -9,17 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from builders import sphere
-from cuspid.errors import InputError
 from cuspid.evaluation.crown import OpenCrown, open_parts
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate, statistics
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.search import SearchOptions
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.trueness import Trueness
-from cuspid.visibility import openness
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.trueness import Trueness
+from cuspid.model.visibility import openness
+from cuspid.runtime.errors import InputError
 from horseshoe import horseshoe
 
 IN_PLACE = EvaluationOptions(align=False, samples=40_000, registration=RegistrationOptions(samples=10_000))

@@ -15,7 +15,7 @@ from typing import get_type_hints
 import pytest
 
 from cuspid import cli, storage
-from cuspid.pairing import stereo_pairs
+from cuspid.model.pairing import stereo_pairs
 from documents import ROOT, Block, blocks, commands, mentions, pages, words
 
 RUN = ["tutorial.md", *(f"how-to/{path.name}" for path in sorted((ROOT / "docs/how-to").glob("*.md")))]

@@ -1,8 +1,9 @@
 import numpy as np
 from hypothesis import assume, given
 
-from cuspid.camera import Camera
-from cuspid.epipolar import (
+from cuspid.geometry import Rigid3
+from cuspid.model.camera import Camera
+from cuspid.model.epipolar import (
     epipolar_lines,
     epipolar_residuals,
     fundamental_matrix,
@@ -10,7 +11,6 @@ from cuspid.epipolar import (
     skew,
     triangulate,
 )
-from cuspid.geometry import Rigid3
 from strategies import rigid3s, vectors
 
 CAMERA = Camera.from_field_of_view(500, 500, 62.0)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cuspid import pipeline, storage
+from cuspid import storage
+from cuspid.pipeline import scan as pipeline
 
 pytestmark = pytest.mark.documentation
 

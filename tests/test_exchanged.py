@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuspid import pipeline
-from cuspid.capture import Capture, Frame
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.model.capture import Capture, Frame
+from cuspid.model.reconstruction import Reconstruction
+from cuspid.model.rig import Rig
 from cuspid.motion.exchanged import check_cameras, require_own_images
 from cuspid.motion.location import MotionOptions
-from cuspid.pipeline import ReconstructionOptions
-from cuspid.reconstruction import Reconstruction
-from cuspid.rig import Rig
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions
+from cuspid.runtime.errors import InputError
 from synthetic_scene import diamond, render
 from test_any_rig import InMemory
 from test_session import HILLS, WAY

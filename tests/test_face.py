@@ -15,18 +15,18 @@ import pytest
 
 import cuspid
 from builders import folder_capture, handpiece, write_frames
-from cuspid import panorama_pipeline
-from cuspid.arch_curve import arch_curve
-from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions
-from cuspid.image_sequence import ImageSequence
-from cuspid.jaw import Jaw
-from cuspid.panorama import FrameUse, Panorama
-from cuspid.pipeline import scannable
-from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.capture import Dropped
+from cuspid.model.image_sequence import ImageSequence
+from cuspid.model.jaw import Jaw
+from cuspid.model.panorama import FrameUse, Panorama
+from cuspid.model.reconstruction import DepthMap, Reconstruction
+from cuspid.model.trueness import GroundTruth, Trueness
+from cuspid.pipeline import panorama as panorama_pipeline
+from cuspid.pipeline.scan import scannable
 from cuspid.stitching.ortho import Stitched
-from cuspid.trueness import GroundTruth, Trueness
 
 QUICK = cuspid.EvaluationOptions(align=False, samples=20_000)
 ASKED = {

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from builders import any_pose, joined, moved, plate, sphere
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.cli import main
-from cuspid.facing import facing_outwards
-from cuspid.mesh import Mesh
+from cuspid.model.facing import facing_outwards
+from cuspid.model.mesh import Mesh
+from cuspid.pipeline import scan as pipeline
 from horseshoe import horseshoe, with_palate, without_base
 
 JAW = horseshoe(120, 40)

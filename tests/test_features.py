@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from builders import folder_capture, image_path, mottled
-from cuspid.camera import Camera
-from cuspid.capture import Capture
-from cuspid.errors import InputError, OutputError
 from cuspid.geometry import Rigid3
-from cuspid.motion.features import DESCRIPTOR_NORM, FeatureOptions, detect, detect_all, spread, without_doubles
-from cuspid.motion.pairs import match_unguided
-from cuspid.motion.pictures import Pictures
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Capture
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.motion.frontend.features import DESCRIPTOR_NORM, FeatureOptions, detect, detect_all, spread, without_doubles
+from cuspid.motion.frontend.pairs import match_unguided
+from cuspid.motion.frontend.pictures import Pictures
+from cuspid.runtime.errors import InputError, OutputError
 
 SIZE = 240
 

@@ -7,13 +7,12 @@ import pytest
 from matplotlib.text import Text
 
 from builders import joined, moved, sphere
-from cuspid.errors import InputError, OutputError
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.reporting.figures.comparison import Curve, save_comparison_picture
-from cuspid.reporting.figures.drawing import (
+from cuspid.model.mesh import Mesh
+from cuspid.report.figures.comparison import Curve, save_comparison_picture
+from cuspid.report.figures.drawing import (
     NOT_COUNTED,
     OCCLUSAL,
     FigureOptions,
@@ -25,6 +24,7 @@ from cuspid.reporting.figures.drawing import (
     save_figure,
     save_picture,
 )
+from cuspid.runtime.errors import InputError, OutputError
 from horseshoe import horseshoe
 
 

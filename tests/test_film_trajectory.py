@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.arch_curve import ArchCurve, arch_curve
 from cuspid.handpiece.intra_oral import intra_oral_camera
+from cuspid.model.arch_curve import ArchCurve, arch_curve
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.stitching.trajectory import frames_there
 from horseshoe import horseshoe

@@ -17,8 +17,6 @@ from hypothesis import strategies as st
 
 from builders import mottled
 from cuspid import storage
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.footage.quality import Looks, QualityOptions, faults, look, seen
 from cuspid.footage.synchronise import (
     SyncOptions,
@@ -30,8 +28,10 @@ from cuspid.footage.synchronise import (
     offset_between,
 )
 from cuspid.geometry import Rigid3
-from cuspid.image_files import read_image
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import read_image
 from cuspid.storage.videos import read_video
 from verbs import refused, run
 

@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cuspid import pipeline
 from cuspid.handpiece.designs import DesignOptions, essential_four
-from cuspid.jaw import Jaw
+from cuspid.model.jaw import Jaw
+from cuspid.pipeline import scan as pipeline
+from cuspid.runtime.workers import usable_cores
 from cuspid.simulation import stage
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
-from cuspid.workers import usable_cores
 
 
 class Clock:

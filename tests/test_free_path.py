@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cuspid import storage
-from cuspid.arch_curve import arch_curve
 from cuspid.cli import main
-from cuspid.errors import InputError
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.jaw import Jaw
-from cuspid.room import Room
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.jaw import Jaw
+from cuspid.model.room import Room
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.free import REACH, FreePathOptions, hand_noise, plan_free_path
 from horseshoe import horseshoe, with_palate
 from verbs import refused

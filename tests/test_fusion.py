@@ -14,19 +14,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera
+from cuspid.fusion.cleaning import CleaningOptions
+from cuspid.fusion.depth_fusion import FusionOptions, Votes, find_holes
+from cuspid.fusion.depth_fusion import fuse as fuse_depth_maps
+from cuspid.fusion.evidence import Evidence, observe, observe_foot
+from cuspid.fusion.sharp_edges import SharpEdgeOptions
+from cuspid.fusion.stage import find_holes as find_holes_once
+from cuspid.fusion.stage import fuse as fuse_once
+from cuspid.fusion.volume import around, find, pack, unpack
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.reconstruction import DepthMap
-from cuspid.stereo.stage import StoredDepthMaps
-from cuspid.surface.cleaning import CleaningOptions
-from cuspid.surface.evidence import Evidence, observe, observe_foot
-from cuspid.surface.fusion import FusionOptions, Votes, find_holes
-from cuspid.surface.fusion import fuse as fuse_depth_maps
-from cuspid.surface.sharp_edges import SharpEdgeOptions
-from cuspid.surface.stage import find_holes as find_holes_once
-from cuspid.surface.stage import fuse as fuse_once
-from cuspid.surface.volume import around, find, pack, unpack
+from cuspid.model.camera import Camera
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import DepthMap
+from cuspid.mvs.stage import StoredDepthMaps
 from synthetic_scene import diamond, height_field, true_depth_map
 
 HILLS = height_field(lambda x, y: 5 + 0.3 * np.sin(2 * x) * np.cos(1.7 * y))
@@ -430,9 +430,9 @@ def test_fusion_is_deterministic_and_tells_progress() -> None:
 
 @pytest.mark.parametrize(("cores", "batch"), [(1, 1), (3, 1), (5, 2)])
 def test_neither_cores_nor_batches_change_the_mesh(monkeypatch: pytest.MonkeyPatch, cores: int, batch: int) -> None:
-    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: cores)
-    monkeypatch.setattr("cuspid.workers._BATCH_PER_CORE", batch)
-    monkeypatch.setattr("cuspid.surface.meshing._FEW", 0)
+    monkeypatch.setattr("cuspid.runtime.workers.usable_cores", lambda: cores)
+    monkeypatch.setattr("cuspid.runtime.workers._BATCH_PER_CORE", batch)
+    monkeypatch.setattr("cuspid.fusion.meshing._FEW", 0)
     again = fuse(depth_maps(HILLS), POSES)
     assert np.array_equal(again.vertices, fused_hills().vertices)
     assert np.array_equal(again.faces, fused_hills().faces)

@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, best_similarity, distinct_rows, lengths_along, owned, unit
+from cuspid.runtime.errors import InputError
 from strategies import points, rigid3s, vectors
 
 

@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3, unit
-from cuspid.gloss import leaving
-from cuspid.rig import Handpiece, Light
-from cuspid.stereo.glare import mirrored, seen
-from cuspid.stereo.matching import DepthEstimator, StereoOptions
-from cuspid.stereo.shading import ShadingOptions
+from cuspid.geometry.gloss import leaving
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, Light
+from cuspid.mvs.glare import mirrored, seen
+from cuspid.mvs.matching import DepthEstimator, StereoOptions
+from cuspid.mvs.shading import ShadingOptions
 from plain_scene import lit, photographs
 from synthetic_scene import cast_depth, height_field
 from test_shading import OPTIONS, errors_um, of_one_frame, white

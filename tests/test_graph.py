@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.graph import graph_of, parts_of
+from cuspid.geometry.graph import graph_of, parts_of
 
 COUNT = 9
 

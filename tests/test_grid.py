@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import grid_cases
-from cuspid.errors import InputError
+from cuspid.runtime.errors import InputError
 from cuspid.studies.grid import Case, grid, run_grid, table
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cuspid.fusion.growing import GrowingSurface
+from cuspid.fusion.meshing import extract
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.surface.growing import GrowingSurface
-from cuspid.surface.meshing import extract
+from cuspid.model.mesh import Mesh
 from synthetic_scene import diamond, height_field, true_depth_map
 
 HILLS = height_field(lambda x, y: 5 + 0.3 * np.sin(2 * x) * np.cos(1.7 * y))

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.motion.held_calibration import depth_sigma_mm
-from cuspid.rig import Handpiece, MountedCamera, Rig
-from cuspid.tolerances import NominalOptions, Tolerances, held
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.tolerances import NominalOptions, Tolerances, held
+from cuspid.motion.bundle.held_calibration import depth_sigma_mm
 from test_any_rig import times
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.camera import Camera
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
 from cuspid.simulation.appearance import APPEARANCES
 from cuspid.simulation.hits import Rays, ShadedMesh, first_hits, traced
 from cuspid.simulation.raycast import Scene, lamps, pixel_rays

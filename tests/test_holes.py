@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 
 from builders import folder_capture, image_path
 from cuspid import storage
-from cuspid.capture import Frame
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
-from cuspid.stereo import stage
-from cuspid.stereo.across import AcrossOptions
-from cuspid.stereo.holes import Sightings, Views, covering
-from cuspid.stereo.matching import StereoOptions
+from cuspid.model.capture import Frame
+from cuspid.model.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
+from cuspid.mvs import stage
+from cuspid.mvs.across import AcrossOptions
+from cuspid.mvs.holes import Sightings, Views, covering
+from cuspid.mvs.matching import StereoOptions
 from synthetic_scene import diamond
 
 SETS = st.lists(st.sets(st.integers(0, 39), max_size=15), max_size=12)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cuspid.errors import InputError
-from cuspid.image_files import (
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import (
     as_8_bits,
     exif_orientation,
     image_size,
@@ -162,6 +162,6 @@ def test_what_is_stretched_beyond_white_stays_white_in_8_bits() -> None:
 
 def test_to_import_cuspid_leaves_the_filters_of_warnings_alone() -> None:
     code = "import warnings, numpy, PIL.Image, cv2, scipy.spatial, trimesh; before = list(warnings.filters);"
-    code += "import cuspid.image_files, cuspid.capture, cuspid.storage; print(warnings.filters == before)"
+    code += "import cuspid.runtime.image_files, cuspid.model.capture, cuspid.storage; print(warnings.filters == before)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"

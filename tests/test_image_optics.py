@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cuspid.camera import Camera
-from cuspid.capture import Frame
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Frame
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.appearance import APPEARANCES
 from cuspid.simulation.optics import CLINICAL, IDEAL, Optics, OpticsOptions, mixed, recorded, through_lens
 from cuspid.simulation.raycast import Scene, motions, render_image, smeared

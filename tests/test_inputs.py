@@ -14,10 +14,10 @@ from PIL import Image
 
 from builders import sphere, write_frames
 from cuspid import storage
-from cuspid.errors import InputError, OutputError
 from cuspid.handpiece.designs import DESIGNS
-from cuspid.image_files import image_size, read_image
-from cuspid.inputs import LARGEST_MIB, read_text, require_file
+from cuspid.runtime.errors import InputError, OutputError
+from cuspid.runtime.image_files import image_size, read_image
+from cuspid.runtime.inputs import LARGEST_MIB, read_text, require_file
 from verbs import refused
 
 

@@ -17,7 +17,7 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 import cuspid
-from cuspid.kernels import CheckedFile
+from cuspid.runtime.kernels import CheckedFile
 
 
 def cache_file(folder: Path, stamp: str = "source") -> CheckedFile:
@@ -63,13 +63,13 @@ def test_code_of_older_sources_does_not_count(tmp_path: Path, monkeypatch: pytes
 @pytest.mark.long
 def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path: Path) -> None:
     (tmp_path / "outer.py").write_text(
-        "from cuspid.kernels import kernel\nfrom inner import grown\n\n"
+        "from cuspid.runtime.kernels import kernel\nfrom inner import grown\n\n"
         "@kernel\ndef twice(x):\n    return 2 * grown(x)\n"
     )
 
     def run(by: int) -> str:
         inner = tmp_path / "inner.py"
-        inner.write_text(f"from cuspid.kernels import kernel\n\n@kernel\ndef grown(x):\n    return x + {by}\n")
+        inner.write_text(f"from cuspid.runtime.kernels import kernel\n\n@kernel\ndef grown(x):\n    return x + {by}\n")
         os.utime(inner, (by, by))
         shown = [sys.executable, "-c", "from outer import twice; print(twice(3), twice.stats.cache_hits)"]
         environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
@@ -81,7 +81,7 @@ def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path:
 
 
 SLOW = """
-from cuspid.kernels import kernel
+from cuspid.runtime.kernels import kernel
 
 @kernel
 def inner(x):
@@ -98,7 +98,7 @@ outer(2.0)
 print(sum(outer.stats.cache_misses.values()) + sum(inner.stats.cache_misses.values()))
 """
 WRONG = """
-from cuspid.kernels import kernel
+from cuspid.runtime.kernels import kernel
 
 @kernel
 def wrong(x):
@@ -114,7 +114,7 @@ for k in (1, 2.0):
 FORKED = """
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from cuspid.kernels import kernel
+from cuspid.runtime.kernels import kernel
 
 @kernel
 def twice(x):

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid.anatomy.landmarks.scheme import in_frame, labels_of, missing, teeth_named, validate
-from cuspid.errors import InputError
-from cuspid.jaw import UNIVERSAL_FROM_FDI, Landmark
+from cuspid.model.jaw import UNIVERSAL_FROM_FDI, Landmark
+from cuspid.runtime.errors import InputError
 from cuspid.storage import LandmarkFile, read_landmarks, write_landmarks, write_table
 from strategies import rigid3s
 

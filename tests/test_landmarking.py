@@ -12,10 +12,10 @@ from cuspid.anatomy.landmarks.estimation import SIGMA_MM, estimate_landmarks, wi
 from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, labels_of, missing
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import GUM, Jaw, Landmark
-from cuspid.reporting.figures.landmark import save_landmark_picture, save_measure_picture
+from cuspid.model.jaw import GUM, Jaw, Landmark
+from cuspid.report.figures.landmark import save_landmark_picture, save_measure_picture
+from cuspid.runtime.errors import InputError
 
 # The uncertainties are from the phantoms of seeds 100 to 113, which no test uses.
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from boards import before_lens
-from cuspid.board import Board
 from cuspid.calibration.causes import cause_of_absence
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.lattice import find_lattice
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
 
 BOARD = Board(kind="chessboard", columns=9, rows=7, square_mm=2.0)
 WIDE = before_lens("OPENCV_FISHEYE", 0).cameras["cam"].resized(320, 240)

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.capture import Capture
 from cuspid.geometry import Rigid3
-from cuspid.motion.least_squares_matching import (
+from cuspid.model.capture import Capture
+from cuspid.model.reconstruction import Reconstruction, Tracks
+from cuspid.model.rig import Rig
+from cuspid.motion.frontend.least_squares_matching import (
     _STENCIL,
     LeastSquaresOptions,
     _facets,
@@ -22,8 +24,6 @@ from cuspid.motion.least_squares_matching import (
     normals_of,
     own_observations,
 )
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import Rig
 from test_odometry import make_capture, make_handpiece
 
 OFF_PX = 0.5

@@ -11,9 +11,9 @@ from boards import BOARD, LENSES_OF, SIZE, before_lens, views_of
 from cuspid.calibration.bundle import mounted_cameras
 from cuspid.calibration.calibrate import calibrate_rig
 from cuspid.calibration.lenses import as_model, choose_lens
-from cuspid.camera import Camera
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.model.camera import Camera
+from cuspid.runtime.errors import ReconstructionError
 
 
 def error_sigmas(found: Camera, truth: Camera) -> float:

@@ -10,7 +10,7 @@ from hypothesis import given
 from scipy.spatial import KDTree
 
 from cuspid.geometry import Rigid3
-from cuspid.occlusal_plane import crown_tips, crown_tops, levelled, upright
+from cuspid.model.occlusal_plane import crown_tips, crown_tops, levelled, upright
 from cuspid.stitching.height_map import HeightMap
 from cuspid.stitching.levelling import level_by_crowns, turned
 from strategies import vectors

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cuspid import pipeline
 from cuspid.handpiece.designs import DesignOptions, essential_four
+from cuspid.pipeline import scan as pipeline
 from cuspid.simulation.lights import lit
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions, steady_poses

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from cuspid import storage
-from cuspid.capture import Capture, Frame
 from cuspid.cli.live import _Feed, _follow_feed, _pace_frames
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.reporting import live_view
-from cuspid.reporting.growing_view import GrowingView
+from cuspid.model.capture import Capture, Frame
+from cuspid.model.mesh import Mesh
+from cuspid.report import live_view
+from cuspid.report.growing_view import GrowingView
+from cuspid.runtime.errors import InputError
 from test_session import FIXED, scan, smooth, with_frame
 from verbs import refused, run
 

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.motion.single import loose_notes, loosely_held
-from cuspid.panorama import FrameUse
+from cuspid.model.panorama import FrameUse
+from cuspid.motion.monocular.single import loose_notes, loosely_held
 
 USUAL = 400
 

@@ -7,10 +7,10 @@ import pytest
 
 from cuspid import storage
 from cuspid.handpiece.designs import DesignOptions, essential_four, twelve_cameras
+from cuspid.model.tolerances import EXACT, NominalOptions, held, is_nominal
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.simulation.stage import SimulationOptions, simulate
-from cuspid.tolerances import EXACT, NominalOptions, held, is_nominal
 
 ROUGH = ManufacturingOptions(
     manufacturing_um=10.0,

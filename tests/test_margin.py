@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from cuspid import storage
-from cuspid.errors import InputError
 from cuspid.evaluation.margin import MarginOptions, cut_margin, cut_margins, margin_error
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from verbs import run
 
 TURNS = 180

@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from builders import plate, sphere
 from cuspid.geometry import Rigid3
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
 from cuspid.simulation import raycast
 from cuspid.simulation.appearance import APPEARANCES, GRADIENT_NOISE_SD, gradient_noise, palette
 from cuspid.simulation.marks import Marks, hollow_mm, natural_marks, no_marks

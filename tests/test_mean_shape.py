@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 from cuspid.anatomy.shape.correspondence import Target, Template, fit, warp
 from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape, principal_modes, vertex_areas
 from cuspid.anatomy.shape.procrustes import superpose
-from cuspid.errors import InputError
-from cuspid.jaw import GUM, Jaw, Landmark
-from cuspid.mesh import Mesh
-from cuspid.reporting.figures.shape import save_modes_picture, save_variance_picture
-from cuspid.shape_model import ShapeModel
+from cuspid.model.jaw import GUM, Jaw, Landmark
+from cuspid.model.mesh import Mesh
+from cuspid.model.shape_model import ShapeModel
+from cuspid.report.figures.shape import save_modes_picture, save_variance_picture
+from cuspid.runtime.errors import InputError
 from cuspid.storage import read_shape_model, write_shape_model
 
 SCORES = np.array([[1.2, -0.4, 0.9], [-0.9, 1.1, 0.4], [0.3, -1.3, -0.2], [-0.6, 0.6, -1.1]])

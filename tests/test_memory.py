@@ -10,7 +10,7 @@ GLIBC = sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt")
 CODE = """
 from pathlib import Path
 import numpy as np
-from cuspid.memory import trim_heap, keep_freed
+from cuspid.runtime.memory import trim_heap, keep_freed
 
 def held_mib():
     return int(Path("/proc/self/statm").read_text().split()[1]) // 256

@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from builders import any_pose, sphere
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import FDI_FROM_UNIVERSAL, UNIVERSAL_FROM_FDI, Jaw
-from cuspid.mesh import Mesh, edges_of
+from cuspid.model.jaw import FDI_FROM_UNIVERSAL, UNIVERSAL_FROM_FDI, Jaw
+from cuspid.model.mesh import Mesh, edges_of
+from cuspid.runtime.errors import InputError
 from strategies import rigid3s
 
 
@@ -34,7 +34,7 @@ def test_crosses_and_vertex_normals_are_those_that_numpy_gives(seed):
 
 
 def test_rays_of_all_cores_hit_what_those_of_one_hit(monkeypatch):
-    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: 5)
+    monkeypatch.setattr("cuspid.runtime.workers.usable_cores", lambda: 5)
     mesh, rng = sphere(10.0), np.random.default_rng(0)
     origins, directions = rng.normal(0, 12, (2, 503, 3))
     expected, found = mesh.cast(origins, directions, 0.5), mesh.cast_on_all_cores(origins, directions, 0.5)
@@ -157,7 +157,7 @@ def test_a_simplified_mesh_has_no_more_faces_and_the_same_surface(most: int) -> 
 
 def test_a_mesh_of_many_faces_is_joined_before_it_is_collapsed(monkeypatch: pytest.MonkeyPatch) -> None:
     """As fine as it would have to be for the collapse alone, and as good."""
-    monkeypatch.setattr("cuspid.mesh._MOST_COLLAPSED", 10_000)
+    monkeypatch.setattr("cuspid.model.mesh._MOST_COLLAPSED", 10_000)
     ball = sphere(10.0, subdivisions=6)
     found = ball.simplified(2000)
     assert 1000 < len(found.faces) <= 2000

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from cuspid import storage
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.panorama import ZONES, Panorama
-from cuspid.panorama_pipeline import MeshViewOptions, view_mesh
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.panorama import ZONES, Panorama
+from cuspid.pipeline.panorama import MeshViewOptions, view_mesh
+from cuspid.runtime.errors import InputError
 from cuspid.stitching.mesh_views import MeshViews, draw_mesh
 from cuspid.stitching.strip import StripOptions
 from verbs import refused, run

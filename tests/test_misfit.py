@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from cuspid.geometry import Rigid3
-from cuspid.motion import misfit
-from cuspid.motion.adjustment import AdjustmentOptions, adjust
-from cuspid.reconstruction import Reconstruction
-from cuspid.rig import MountedCamera, Rig
+from cuspid.model.reconstruction import Reconstruction
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.motion.bundle import misfit
+from cuspid.motion.bundle.adjustment import AdjustmentOptions, adjust
 from test_adjustment import EXTRINSIC_SIGMA, PARAMETER_SIGMA, SIGMA_PX, disturbed, make_rig, make_scene, pose_errors
 
 

@@ -29,8 +29,8 @@ from cuspid.anatomy.mouth import (
     tooth_ends_mm,
     typical_mouth,
 )
-from cuspid.errors import InputError
-from cuspid.reporting.figures.mouth import save_fit_picture, save_gap_picture, save_sagittal_picture
+from cuspid.report.figures.mouth import save_fit_picture, save_gap_picture, save_sagittal_picture
+from cuspid.runtime.errors import InputError
 
 R, H = 90.0, 90.0 * np.sin(np.deg2rad(22.5))
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from boards import BOARD, SIZE, before_lens, scene, views_of
-from cuspid.board import Board
 from cuspid.calibration.board_shape import BoardShape, nodes_of
 from cuspid.calibration.bundle import adjust_board, mounted_cameras
 from cuspid.calibration.calibrate import CalibrationOptions, calibrate_rig
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.scatter import covariance_of
 from cuspid.calibration.uncertainty import lens_difference_px
+from cuspid.model.board import Board
 
 OPENCV = CalibrationOptions(lens="OPENCV")
 

@@ -11,9 +11,9 @@ from cuspid import storage
 from cuspid.anatomy.jaw_files import Labelling, load_jaw
 from cuspid.anatomy.numbering import Numbering, number_teeth
 from cuspid.cli import main
-from cuspid.errors import InputError
-from cuspid.jaw import GUM, UNIVERSAL_FROM_FDI, Arch, Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, UNIVERSAL_FROM_FDI, Arch, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from horseshoe import horseshoe
 
 LOWER = horseshoe(150, 40)

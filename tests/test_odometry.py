@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 from builders import CAMERA, folder_capture, image_path, mottled
-from cuspid.camera import Camera
-from cuspid.capture import Capture
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Capture
+from cuspid.model.pairing import stereo_pairs
+from cuspid.model.reconstruction import Expectation, Reconstruction, Tracks
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
 from cuspid.motion import MotionOptions, locate
-from cuspid.motion.features import DESCRIPTOR_NORM, Features, detect_all
-from cuspid.motion.least_squares_matching import LeastSquaresOptions
+from cuspid.motion.frontend.features import DESCRIPTOR_NORM, Features, detect_all
+from cuspid.motion.frontend.least_squares_matching import LeastSquaresOptions
+from cuspid.motion.frontend.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
+from cuspid.motion.frontend.pairs import MatchingOptions, index_features
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.location import _advice, _loose_notes, locate_features, stereo_ties
-from cuspid.motion.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
-from cuspid.motion.pairs import MatchingOptions, index_features
-from cuspid.motion.pictures import Pictures
-from cuspid.pairing import stereo_pairs
-from cuspid.reconstruction import Expectation, Reconstruction, Tracks
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.runtime.errors import ReconstructionError
 
 SIGMA_PX = 0.2
 Keypoints = dict[tuple[str, str], Features]

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.errors import InputError
 from cuspid.handpiece.optics import Optics, horizontal_from_diagonal_deg
 from cuspid.handpiece.presets import PRESETS
+from cuspid.runtime.errors import InputError
 
 THESIS = Optics(name="thesis", width_px=500, height_px=500, pixel_um=1.6, field_of_view_deg=62.0, f_number=7.0)
 

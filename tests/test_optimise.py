@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.brief import CamerasBrief, DesignBrief, MouthBrief, parse_brief, read_brief
 from cuspid.handpiece.designs import essential_four, six_cameras, twelve_cameras
@@ -26,9 +25,10 @@ from cuspid.handpiece.optimise import (
 )
 from cuspid.handpiece.precision import bound_rms_um, fisher_information
 from cuspid.handpiece.presets import PRESETS
-from cuspid.mesh import Mesh
-from cuspid.reporting.figures.design import save_design_picture
-from cuspid.rig import Handpiece
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
+from cuspid.report.figures.design import save_design_picture
+from cuspid.runtime.errors import InputError
 
 SMALL = """
 sensor = "thesis"

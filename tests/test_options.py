@@ -13,8 +13,8 @@ import pytest
 
 import cuspid
 from cuspid.cli import COMMANDS, main
-from cuspid.errors import InputError
-from cuspid.options import Options, Range, check, limits
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range, check, limits
 
 
 def option_classes() -> list[type]:

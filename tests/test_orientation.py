@@ -8,9 +8,9 @@ from builders import any_pose, joined, moved, sphere
 from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, require_one_jaw
-from cuspid.errors import InputError
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from cuspid.storage import Unit
 from horseshoe import horseshoe, without_base
 

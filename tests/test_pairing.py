@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from builders import rig_of, shifted
 from cuspid import storage
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, six_cameras, twelve_cameras
-from cuspid.pairing import (
+from cuspid.model.pairing import (
     PairingOptions,
     camera_groups,
     guess_working_distance_mm,
@@ -23,6 +22,7 @@ from cuspid.pairing import (
     stereo_pairs,
     worth_of_angle,
 )
+from cuspid.runtime.errors import InputError
 
 DESIGNS = Path(__file__).parent.parent / "benchmarks" / "designs"
 FOUND = [storage.read_handpiece(path) for path in sorted(DESIGNS.glob("*.json"))]

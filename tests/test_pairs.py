@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.motion.features import DESCRIPTOR_NORM, Features
-from cuspid.motion.pairs import (
+from cuspid.model.camera import Camera
+from cuspid.motion.frontend.features import DESCRIPTOR_NORM, Features
+from cuspid.motion.frontend.pairs import (
     IndexedFeatures,
     MatchingOptions,
     frame_pairs,
@@ -21,7 +21,7 @@ from cuspid.motion.pairs import (
     match_guided,
     match_unguided,
 )
-from cuspid.motion.tracks import intersect_rays, join, thin
+from cuspid.motion.frontend.tracks import intersect_rays, join, thin
 
 B_FROM_A = Rigid3.from_rotation_vector(np.array([0.02, -0.05, 0.03]), np.array([-1.2, 0.3, 0.1]))
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuspid.errors import InputError
-from cuspid.panorama import FrameUse, Panorama
+from cuspid.model.panorama import FrameUse, Panorama
+from cuspid.runtime.errors import InputError
 from cuspid.storage import read_panorama, write_panorama
 
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from cuspid import storage
 from cuspid.cli import main
-from cuspid.errors import InputError
 from cuspid.evaluation import panorama as evaluation
 from cuspid.evaluation.panorama import (
     PanoramaEvaluationOptions,
@@ -29,12 +28,13 @@ from cuspid.evaluation.panorama import (
 )
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.jaw import Jaw
-from cuspid.panorama import FrameUse, Panorama
+from cuspid.model.jaw import Jaw
+from cuspid.model.panorama import FrameUse, Panorama
+from cuspid.model.trueness import GroundTruth, ReferenceRender
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.appearance import APPEARANCES
 from cuspid.simulation.raycast import Scene
 from cuspid.simulation.reference_render import ReferenceRenderOptions, render_reference
-from cuspid.trueness import GroundTruth, ReferenceRender
 
 STEP_MM = 0.2
 

@@ -11,12 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.motion.guided import GuidedOptions
-from cuspid.motion.patches import (
+from cuspid.model.camera import Camera
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import Reconstruction, Tracks, chosen_tracks, joined_tracks
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.model.sparse_model import SparseModel
+from cuspid.motion.frontend.patches import (
     PatchOptions,
     align_patches,
     cut_patches,
@@ -25,10 +26,9 @@ from cuspid.motion.patches import (
     hold_together,
     lengthen,
 )
-from cuspid.motion.tracks import points_across
-from cuspid.reconstruction import Reconstruction, Tracks, chosen_tracks, joined_tracks
-from cuspid.rig import MountedCamera, Rig
-from cuspid.sparse_model import SparseModel
+from cuspid.motion.frontend.tracks import points_across
+from cuspid.motion.monocular.guided import GuidedOptions
+from cuspid.runtime.errors import InputError
 
 
 def wall(seed: int = 0, size: int = 400) -> np.ndarray:

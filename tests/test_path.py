@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from builders import any_pose, sphere
-from cuspid.arch_curve import ArchCurve, arch_curve
 from cuspid.evaluation.crown import open_parts
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.jaw import GUM, Jaw
-from cuspid.room import Room
+from cuspid.model.arch_curve import ArchCurve, arch_curve
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.room import Room
+from cuspid.model.visibility import VisibilityOptions, scannable_faces, visible_counts
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.detour import _APART, _UNITS, _motion, _shortest, plan_detour
 from cuspid.simulation.path.further import _largest_sum, _Trial, _woven, further_legs, seen_from
 from cuspid.simulation.path.legs import Leg, steady_path
 from cuspid.simulation.path.overlap import frame_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, _goes_on, plan_scan_path
-from cuspid.visibility import VisibilityOptions, scannable_faces, visible_counts
 
 HANDPIECE = twelve_cameras()
 

@@ -16,7 +16,7 @@ from cuspid.anatomy.phantom.build import build_phantom, phantom_landmarks, phant
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.teeth.crowns import Points
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS
-from cuspid.jaw import GUM, Jaw
+from cuspid.model.jaw import GUM, Jaw
 
 COARSE_MM = 0.4
 """Edge length at which the tests mesh the phantom."""

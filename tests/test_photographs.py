@@ -12,17 +12,18 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from cuspid import cli, photograph_pipeline
-from cuspid.errors import CuspidError, InputError, ReconstructionError
+from cuspid import cli
 from cuspid.geometry import best_similarity
+from cuspid.model.photographs import PhotoCamera, Photograph
+from cuspid.model.reconstruction import Tracks
+from cuspid.model.sparse_model import PhotoModel
 from cuspid.motion.colmap import write_model
-from cuspid.motion.photograph_matches import detect_in_all
-from cuspid.motion.photograph_poses import take_photograph_poses
-from cuspid.motion.photographs import PhotographOptions, locate_photographs
-from cuspid.motion.scale import BoardSighting, PhotoScaleOptions, scale_by_board
-from cuspid.photographs import PhotoCamera, Photograph
-from cuspid.reconstruction import Tracks
-from cuspid.sparse_model import PhotoModel
+from cuspid.motion.monocular.photograph_matches import detect_in_all
+from cuspid.motion.monocular.photograph_poses import take_photograph_poses
+from cuspid.motion.monocular.photographs import PhotographOptions, locate_photographs
+from cuspid.motion.monocular.scale import BoardSighting, PhotoScaleOptions, scale_by_board
+from cuspid.pipeline import photographs as photograph_pipeline
+from cuspid.runtime.errors import CuspidError, InputError, ReconstructionError
 from cuspid.storage.photographs import is_photographs, read_photographs
 from photo_scene import BOARD, BOARD_PLACE_MM, WIDE, scene
 from synthetic_scene import speckle

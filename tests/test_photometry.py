@@ -11,7 +11,6 @@ import pytest
 
 from boards import options as board_options
 from cuspid import storage
-from cuspid.board import Board
 from cuspid.calibration.calibrate import RigCalibration, in_frame_of
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.noise import Noise
@@ -25,10 +24,11 @@ from cuspid.calibration.photometry import (
     look_at_patches,
 )
 from cuspid.calibration.shading import Given, Samples, _model, polynomials, prior
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, essential_four
-from cuspid.rig import Handpiece, Light, Sensor
+from cuspid.model.board import Board
+from cuspid.model.rig import Handpiece, Light, Sensor
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.board_images import PhotographOptions, board_light, board_poses, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
 from cuspid.simulation.raycast import pixel_rays

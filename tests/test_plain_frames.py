@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cuspid.geometry import Rigid3
-from cuspid.motion.surfaces import Surface
+from cuspid.motion.icp.surfaces import Surface
 from synthetic_scene import height_field
 from test_surface_tracking import OUT, depth_maps, surface
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuspid import pipeline
 from cuspid.handpiece.designs import DesignOptions, essential_four
-from cuspid.jaw import Jaw
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
+from cuspid.model.jaw import Jaw
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import read_json
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.gloss import leaving
-from cuspid.reconstruction import Tracks
-from cuspid.sparse_model import SparseModel
+from cuspid.geometry.gloss import leaving
+from cuspid.model.camera import Camera
+from cuspid.model.reconstruction import Tracks
+from cuspid.model.sparse_model import SparseModel
+from cuspid.runtime.errors import InputError
 from cuspid.stitching.compared import Compared, frames_beside, partners
 from cuspid.stitching.height_map import (
     HeightMap,
@@ -286,7 +286,7 @@ def mosaic(scene: Scene, surface: HeightMap) -> Mosaic:
 def test_the_number_of_cores_does_not_change_the_mosaic(
     scene: Scene, surface: HeightMap, mosaic: Mosaic, monkeypatch: pytest.MonkeyPatch, cores: int
 ) -> None:
-    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: cores)
+    monkeypatch.setattr("cuspid.runtime.workers.usable_cores", lambda: cores)
     again = compose(scene.motion, surface, scene.read, MosaicOptions())
     assert np.array_equal(again.image, mosaic.image)
     assert np.array_equal(again.frame_pixel, mosaic.frame_pixel, equal_nan=True)

@@ -14,8 +14,8 @@ from cuspid.anatomy.landmarks.scheme import labels_of
 from cuspid.anatomy.phantom.build import build_phantom, phantom_landmarks, phantom_teeth
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GROUPS, LENGTHS, GroupName, Normal, draw_and_count, draw_population
-from cuspid.errors import InputError
-from cuspid.jaw import Arch, Jaw, Landmark
+from cuspid.model.jaw import Arch, Jaw, Landmark
+from cuspid.runtime.errors import InputError
 
 TOLERANCE_MM = 0.05
 QUADRANTS = {"lower": (30, 40), "upper": (10, 20)}

@@ -24,7 +24,7 @@ import sys
 from importlib import import_module
 from pkgutil import walk_packages
 import cuspid
-from cuspid import workers
+from cuspid.runtime import workers
 
 if __name__ == "__main__":
     for found in walk_packages(cuspid.__path__, "cuspid."):

@@ -6,8 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from builders import plate
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.precision import (
     NoiseModel,
@@ -25,7 +23,9 @@ from cuspid.handpiece.precision import (
     triangulate,
 )
 from cuspid.handpiece.presets import PRESETS
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.runtime.errors import InputError
 
 CAMERA = Camera.from_field_of_view(512, 512, 62.0)
 

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.image import imread
 
 from builders import plate
-from cuspid.reporting.figures.precision import (
+from cuspid.report.figures.precision import (
     Panel,
     save_best_picture,
     save_ellipsoids_picture,

@@ -20,9 +20,9 @@ from cuspid.anatomy.preparation.prepare import (
     preset,
 )
 from cuspid.anatomy.preparation.tooth_site import ToothSite, site_of
-from cuspid.errors import InputError
-from cuspid.jaw import GUM, Jaw, Landmark
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, Jaw, Landmark
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 
 DOWN = np.array([0.0, 0.0, -1.0])
 

@@ -8,16 +8,16 @@ import trimesh
 from manifold3d import Manifold, OpType
 
 from cuspid import storage
-from cuspid.body import Body
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.handpiece.cad.holder import HolderOptions
+from cuspid.handpiece.cad.printability import check_printable, check_seats, check_sight, check_solid, thinnest
+from cuspid.handpiece.cad.printable import Printable, block, printable, rounded
+from cuspid.handpiece.cad.shell import PrintOptions, module_boxes
 from cuspid.handpiece.designs import DESIGNS, DesignOptions, six_cameras
-from cuspid.handpiece.holder import HolderOptions
 from cuspid.handpiece.intra_oral import intra_oral_camera
-from cuspid.handpiece.printability import check_printable, check_seats, check_sight, check_solid, thinnest
-from cuspid.handpiece.printable import Printable, block, printable, rounded
-from cuspid.handpiece.shell import PrintOptions, module_boxes
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.body import Body
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.runtime.errors import InputError
 from verbs import refused, run
 
 BUILT_IN = {name: make() for name, make in DESIGNS.items()} | {"wand": intra_oral_camera()}

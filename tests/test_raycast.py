@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from builders import SavedImages, sphere
-from cuspid import workers
-from cuspid.camera import Camera
-from cuspid.capture import Frame
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.gloss import coat, leaving
+from cuspid.geometry.gloss import coat, leaving
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Frame
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor
+from cuspid.runtime import workers
+from cuspid.runtime.errors import InputError
 from cuspid.simulation import raycast
 from cuspid.simulation.appearance import (
     APPEARANCES,

@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.reconstruction import DepthMap
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import Camera
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import DepthMap
+from cuspid.model.rig import MountedCamera
 
 ROOT = Path(__file__).parent.parent
 CAMERA = Camera.from_field_of_view(160, 120, 40.0)

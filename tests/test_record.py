@@ -25,11 +25,8 @@ from scipy.spatial.transform import Rotation
 from boards import BOARD, SIZE, looking_at, options, photographs, scene, undistorted
 from builders import mottled
 from cuspid import storage
-from cuspid.board import Board, BoardSet
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.coverage import SIDES, Coverage, CoverageOptions, focal_px_of, homography_of, tilt_of
-from cuspid.camera import Camera
-from cuspid.errors import InputError, OutputError
 from cuspid.footage import record as recorder
 from cuspid.footage.cameras import ExposureOptions
 from cuspid.footage.devices import FormatOptions, V4L2Camera, cameras_there
@@ -38,9 +35,12 @@ from cuspid.footage.played import FilmCamera, RenderedCamera
 from cuspid.footage.record import TABLE, Recording, RecordOptions
 from cuspid.footage.slots import Slots
 from cuspid.geometry import Rigid3
-from cuspid.image_files import read_image
-from cuspid.reporting.preview import Preview, marked
-from cuspid.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.board import Board, BoardSet
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.report.preview import Preview, marked
+from cuspid.runtime.errors import InputError, OutputError
+from cuspid.runtime.image_files import read_image
 from cuspid.storage.files import AppendedTable
 from verbs import refused, run
 

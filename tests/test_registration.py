@@ -6,13 +6,13 @@ import trimesh
 from hypothesis import given, settings
 
 from builders import any_pose, joined, moved, sphere
-from cuspid.errors import InputError
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, fit, refine, register
 from cuspid.evaluation.search import SearchOptions
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from horseshoe import horseshoe
 from strategies import rigid3s
 from synthetic_scene import height_field

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from builders import box_mesh, handpiece, make_capture, rig_of, shifted
-from cuspid import cli, kernels, storage
+from cuspid import cli, storage
 from cuspid.anatomy.jaw_files import jaw_files
-from cuspid.errors import InputError, OutputError
-from cuspid.inputs import is_there
-from cuspid.reporting.same_origin import address, require_address
-from cuspid.rig import MountedCamera
+from cuspid.model.rig import MountedCamera
+from cuspid.report.same_origin import address, require_address
+from cuspid.runtime import kernels
+from cuspid.runtime.errors import InputError, OutputError
+from cuspid.runtime.inputs import is_there
 from cuspid.storage.files import finished
 from test_rescaling import panorama as stitched_panorama
 from test_rescaling import write as write_stitched

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from builders import any_pose, sphere
-from cuspid.body import Body, Box
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, twelve_cameras
-from cuspid.jaw import Jaw
-from cuspid.room import Room
+from cuspid.model.body import Body, Box
+from cuspid.model.jaw import Jaw
+from cuspid.model.room import Room
 from cuspid.simulation.path.detour import repaired
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 

@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cuspid import storage
-from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.repeatability import PairOptions, compare_pair, spread
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
-from cuspid.mesh import Mesh
-from cuspid.pipeline import SimulationOptions
-from cuspid.reporting.figures.repeat import save_repeat_picture
-from cuspid.reporting.pages.report import report_page
+from cuspid.model.mesh import Mesh
+from cuspid.pipeline.scan import SimulationOptions
+from cuspid.report.figures.repeat import save_repeat_picture
+from cuspid.report.pages.report import report_page
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.studies.design_comparison import with_smaller_images
 from cuspid.studies.grid import Outcome

@@ -20,11 +20,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from cuspid import cli, storage
-from cuspid.errors import InputError, MissingDependencyError
-from cuspid.mesh import Mesh
-from cuspid.panorama import FrameUse, Panorama
-from cuspid.reporting import live_view
-from cuspid.reporting.figures.drawing import (
+from cuspid.model.mesh import Mesh
+from cuspid.model.panorama import FrameUse, Panorama
+from cuspid.model.rig import Rig
+from cuspid.report import live_view
+from cuspid.report.figures.drawing import (
     NOT_COUNTED,
     RANGES_UM,
     FigureOptions,
@@ -32,14 +32,14 @@ from cuspid.reporting.figures.drawing import (
     fitting_range_um,
     fitting_sigma_um,
 )
-from cuspid.reporting.pages.color_scale import deviation_scale, sigma_scale
-from cuspid.reporting.pages.page import LARGEST_PAGE_BYTES, flat_settings, number, packed, script_json, signed
-from cuspid.reporting.pages.report import report_page
-from cuspid.reporting.pages.scan import ReportOptions, histogram, worst_places
-from cuspid.reporting.pages.scene import camera_lines
-from cuspid.reporting.pages.shown_mesh import UM_PER_STEP, UNKNOWN, pack_mesh, pack_um, simplified
-from cuspid.reporting.pages.study import heading
-from cuspid.rig import Rig
+from cuspid.report.pages.color_scale import deviation_scale, sigma_scale
+from cuspid.report.pages.page import LARGEST_PAGE_BYTES, flat_settings, number, packed, script_json, signed
+from cuspid.report.pages.report import report_page
+from cuspid.report.pages.scan import ReportOptions, histogram, worst_places
+from cuspid.report.pages.scene import camera_lines
+from cuspid.report.pages.shown_mesh import UM_PER_STEP, UNKNOWN, pack_mesh, pack_um, simplified
+from cuspid.report.pages.study import heading
+from cuspid.runtime.errors import InputError, MissingDependencyError
 from report_folders import (
     BUMP_UM,
     FRAMES,

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from cuspid import cli, storage
-from cuspid.jaw import Jaw
-from cuspid.panorama import Panorama
+from cuspid.model.jaw import Jaw
+from cuspid.model.panorama import Panorama
 from report_folders import tooth_alone, write_comparison, write_scan, write_score, write_shape
 from test_rescaling import panorama
 

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from cuspid import storage
 from cuspid.cli.panorama import clear
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.panorama import FrameUse, Panorama, Strip
+from cuspid.model.jaw import Jaw
+from cuspid.model.panorama import FrameUse, Panorama, Strip
+from cuspid.runtime.errors import InputError
 from cuspid.stitching.rescaling import MeasuredDistance, rescaled
 from test_panorama_evaluation import known_film, score
 from verbs import refused, run

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.motion.features import DESCRIPTOR_NORM, Features
-from cuspid.motion.revisits import look_alike
+from cuspid.motion.frontend.features import DESCRIPTOR_NORM, Features
+from cuspid.motion.frontend.revisits import look_alike
 
 
 def film(places: np.ndarray, rng: np.random.Generator) -> list[Features]:

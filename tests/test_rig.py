@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from builders import THESIS_CAMERA, rig_of, shifted
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, six_cameras, stereo_pair
-from cuspid.pairing import depth_step_mm, detail_mm, resolved_mm
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.pairing import depth_step_mm, detail_mm, resolved_mm
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.runtime.errors import InputError
 from strategies import rigid3s
 
 

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 
 from cuspid import storage
-from cuspid.arch_curve import arch_curve
-from cuspid.capture import Capture
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.jaw import Jaw
-from cuspid.motion.adjustment import AdjustmentOptions
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.capture import Capture
+from cuspid.model.jaw import Jaw
+from cuspid.model.reconstruction import Reconstruction, Tracks
+from cuspid.model.trueness import GroundTruth
+from cuspid.motion.bundle.adjustment import AdjustmentOptions
+from cuspid.motion.monocular.single import SingleOptions
 from cuspid.motion.rig_film import film_options, locate_rig_film, of_camera, refine_rig_on_surface, surface_patches
-from cuspid.motion.single import SingleOptions
-from cuspid.panorama_pipeline import StitchOptions, stitch_rig
-from cuspid.pipeline import RenderOptions, take_images
-from cuspid.reconstruction import Reconstruction, Tracks
+from cuspid.pipeline.panorama import StitchOptions, stitch_rig
+from cuspid.pipeline.scan import RenderOptions, take_images
 from cuspid.stitching.compared import camera_gains, cameras_beside
-from cuspid.trueness import GroundTruth
 from test_stitching import seen_points
 from verbs import refused, run
 

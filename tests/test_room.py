@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from builders import any_pose, plate, sphere
-from cuspid.arch_curve import arch_curve
-from cuspid.body import Body, Box, module
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.handpiece.cad.holder import HolderOptions, with_holder
 from cuspid.handpiece.designs import DESIGNS, DesignOptions, twelve_cameras
 from cuspid.handpiece.family import LAYOUTS, Layout, Shape, build_handpiece
-from cuspid.handpiece.holder import HolderOptions, with_holder
 from cuspid.handpiece.presets import PRESETS
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.room import Room, check_clearance, room_about, surface_points
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.body import Body, Box, module
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.room import Room, check_clearance, room_about, surface_points
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.detour import up
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from cuspid.arch_curve import ArchCurve, arch_curve
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, six_cameras, twelve_cameras
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, Rig
-from cuspid.room import Room
+from cuspid.model.arch_curve import ArchCurve, arch_curve
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, Rig
+from cuspid.model.room import Room
+from cuspid.model.visibility import VisibilityOptions, scannable_faces
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.hand import HandMotion, hand_motion
 from cuspid.simulation.path.legs import steady_path, there_and_back
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path, steady_poses
-from cuspid.visibility import VisibilityOptions, scannable_faces
 
 STILL = ScanPathOptions(tooth=46, jitter_mm=0.0, jitter_deg=0.0)
 

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cuspid import storage
-from cuspid.errors import InputError
 from cuspid.evaluation.alignments import align_points
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import best_motion, deviations_um, scatter
@@ -18,7 +17,8 @@ from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.repeatability import PairOptions, compare_pair
 from cuspid.evaluation.search import SearchOptions
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from cuspid.studies.scanners.files import find_files, without_repeats
 from cuspid.studies.scanners.scan import StudyOptions
 from cuspid.studies.scanners.specimen import guessed_unit, load_specimen
@@ -51,7 +51,7 @@ def jaw():
 def _few_places(monkeypatch):
     """And small figures."""
     monkeypatch.setattr("cuspid.studies.scanners.specimen.PLACES", 12_000)
-    monkeypatch.setattr("cuspid.reporting.figures.scanner_study._DPI", 60)
+    monkeypatch.setattr("cuspid.report.figures.scanner_study._DPI", 60)
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.mvs.matching import DepthEstimator, StereoOptions
 from cuspid.simulation.appearance import APPEARANCES
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.raycast import Scene, _entering_light, auto_gain, lamps, lit_frames, render_image
 from cuspid.simulation.scattering import Scattering
-from cuspid.stereo.matching import DepthEstimator, StereoOptions
 from plain_scene import HILLS, lit
 from synthetic_scene import cast_depth, height_field
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cuspid.semi_global import semi_global
+from cuspid.geometry.semi_global import semi_global
 
 
 @given(arrays(np.float32, (4, 5, 7), elements=st.floats(0, 1, width=16)))

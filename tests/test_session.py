@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuspid import pipeline
-from cuspid.capture import Capture, Frame
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.model.capture import Capture, Frame
+from cuspid.model.mesh import Mesh
 from cuspid.motion.tracker import Tracker
-from cuspid.pipeline import ReconstructionOptions
-from cuspid.session import Session, Step
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions
+from cuspid.pipeline.session import Session, Step
+from cuspid.runtime.errors import InputError, ReconstructionError
 from synthetic_scene import diamond, height_field, render
 from test_any_rig import InMemory
 

@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from boards import SIZE, photograph, scene
 from cuspid import storage
-from cuspid.board import Board, BoardSet
 from cuspid.calibration import bundle
 from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, Views
 from cuspid.calibration.joining import hand_eye, second_turn_deg
-from cuspid.camera import Camera
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.model.board import Board, BoardSet
+from cuspid.model.camera import Camera
+from cuspid.runtime.errors import InputError, ReconstructionError
 from verbs import refused, run
 
 ONE = Board(columns=6, rows=5, square_mm=2.0)

@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap
-from cuspid.rig import Handpiece, Lighting, MountedCamera, Rig, Sensor
-from cuspid.stereo import shading
-from cuspid.stereo.matching import DepthEstimator, StereoOptions, gray
-from cuspid.stereo.refinement import RefinementOptions
-from cuspid.stereo.shading import ShadingOptions
-from cuspid.stereo.signal import choose_signal, detail_dn
+from cuspid.model.camera import Camera
+from cuspid.model.reconstruction import DepthMap
+from cuspid.model.rig import Handpiece, Lighting, MountedCamera, Rig, Sensor
+from cuspid.mvs import shading
+from cuspid.mvs.matching import DepthEstimator, StereoOptions, gray
+from cuspid.mvs.refinement import RefinementOptions
+from cuspid.mvs.shading import ShadingOptions
+from cuspid.mvs.signal import choose_signal, detail_dn
+from cuspid.runtime.errors import InputError
 from plain_scene import HILLS, WAY, capture_of, lit, photographs, plain_scan
 from synthetic_scene import cast_depth, textured
 from test_any_rig import times

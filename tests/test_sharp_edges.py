@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from builders import any_pose, joined, moved, sphere
-from cuspid.errors import InputError
-from cuspid.mesh import Mesh
-from cuspid.surface.sharp_edges import SharpEdgeOptions, sharpened
+from cuspid.fusion.sharp_edges import SharpEdgeOptions, sharpened
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from synthetic_scene import height_field
 
 DETAIL_MM, SPACING_MM, HALF_MM = 0.012, 0.05, 1.0

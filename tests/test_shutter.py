@@ -13,17 +13,17 @@ from scipy.linalg import expm
 
 from builders import handpiece
 from cuspid import storage
-from cuspid.camera import Camera
-from cuspid.capture import Capture, Frame, ImageFolder
-from cuspid.epipolar import skew
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.motion.adjustment import adjust, residuals_px
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import MountedCamera, Rig
-from cuspid.shutter import PLAIN, Shutter, displace_points, film_times, motions
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Capture, Frame, ImageFolder
+from cuspid.model.epipolar import skew
+from cuspid.model.reconstruction import Reconstruction, Tracks
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.model.shutter import PLAIN, Shutter, displace_points, film_times, motions
+from cuspid.model.unrolling import unroll_capture, unrollings
+from cuspid.motion.bundle.adjustment import adjust, residuals_px
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.optics import OpticsOptions, with_shutters
-from cuspid.unrolling import unroll_capture, unrollings
 from test_adjustment import Scene, disturbed, make_rig, make_scene, observe, pose_errors
 
 FRAMES = 7

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.stereo.smoothing import smoothed
+from cuspid.mvs.smoothing import smoothed
 
 SHAPE = 40, 50
 ROWS, COLUMNS = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float64)

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.motion.adjustment import AdjustmentOptions, adjust_model
-from cuspid.reconstruction import Tracks
-from cuspid.sparse_model import SparseModel
+from cuspid.model.camera import Camera
+from cuspid.model.reconstruction import Tracks
+from cuspid.model.sparse_model import SparseModel
+from cuspid.motion.bundle.adjustment import AdjustmentOptions, adjust_model
+from cuspid.runtime.errors import ReconstructionError
 
 FRAMES, POINTS, AWAY = 6, 80, 14.0
 CAMERA = Camera.from_field_of_view(640, 480, 60.0)

@@ -15,15 +15,15 @@ from PIL import Image
 
 from cuspid.anatomy.phantom.sphere_arch import SphereArchOptions, build_sphere_arch
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS
-from cuspid.errors import InputError
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, fit
 from cuspid.evaluation.spheres import SphereOptions, SphereReport, evaluate_spheres, fit_sphere
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.reporting.figures.sphere import save_sphere_picture
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.report.figures.sphere import save_sphere_picture
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 
 COARSE = SphereArchOptions(edge_mm=0.45)

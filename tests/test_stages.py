@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from cuspid import storage
-from cuspid.arch_curve import arch_curve
-from cuspid.errors import InputError, OutputError
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
-from cuspid.jaw import Jaw
-from cuspid.pipeline import RenderOptions, take_images
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.jaw import Jaw
+from cuspid.pipeline.scan import RenderOptions, take_images
+from cuspid.runtime.errors import InputError, OutputError
 from cuspid.storage.captures import hash_capture
 from cuspid.storage.stages import RECORD, Stage, _installed, code_version
 
@@ -59,8 +59,10 @@ def test_a_result_is_made_once_and_again_only_when_something_changed(maker: Make
     assert made_again(maker, Stage("cut", folder, Options(size=1.5)), images="b")
     assert made_again(maker, Stage("cut", folder, Options(size=1.5)), images="b", more="c")
     assert made_again(maker, Stage("paste", folder, Options(size=1.5)), images="b", more="c")
-    assert made_again(maker, Stage("paste", folder, Options(size=1.5), ("cuspid.mesh",)), images="b", more="c")
-    assert not made_again(maker, Stage("paste", folder, Options(size=1.5), ("cuspid.mesh",)), images="b", more="c")
+    assert made_again(maker, Stage("paste", folder, Options(size=1.5), ("cuspid.model.mesh",)), images="b", more="c")
+    assert not made_again(
+        maker, Stage("paste", folder, Options(size=1.5), ("cuspid.model.mesh",)), images="b", more="c"
+    )
 
 
 @pytest.mark.parametrize("damage", [b"", b"result 2", b"resul"])
@@ -135,7 +137,7 @@ def test_a_record_that_cannot_be_written_leaves_no_empty_file(tmp_path: Path) ->
 
 
 def test_the_version_of_the_code_tells_its_parts_apart() -> None:
-    parts = [(), ("cuspid.stereo.stage",), ("cuspid.motion.stage",), ("cuspid.stereo.stage", "cuspid.motion.stage")]
+    parts = [(), ("cuspid.mvs.stage",), ("cuspid.motion.stage",), ("cuspid.mvs.stage", "cuspid.motion.stage")]
     assert len({code_version(*each) for each in parts}) == len(parts)
     with pytest.raises(LookupError, match="stereo"):
         code_version("stereo")
@@ -146,7 +148,7 @@ def test_a_stage_depends_on_what_it_uses_and_not_on_what_stands_above_it(stage: 
     used = _installed().modules([f"cuspid.{stage}.stage"])
     assert f"cuspid.{stage}.stage" in used
     assert len(used) > 20
-    above = ("cuspid.cli", "cuspid.pipeline", "cuspid.studies", "cuspid.reporting", "cuspid.session")
+    above = ("cuspid.cli", "cuspid.pipeline.scan", "cuspid.studies", "cuspid.report", "cuspid.pipeline.session")
     assert not [each for each in used if each.startswith(above)]
 
 

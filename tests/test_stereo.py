@@ -12,13 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.pairing import rank_sources
-from cuspid.reconstruction import DepthMap
-from cuspid.rig import Handpiece, MountedCamera, Rig
-from cuspid.stereo.confidence import (
+from cuspid.model.camera import Camera
+from cuspid.model.pairing import rank_sources
+from cuspid.model.reconstruction import DepthMap
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.mvs.confidence import (
     ConfidenceOptions,
     Measured,
     Resolution,
@@ -27,10 +26,10 @@ from cuspid.stereo.confidence import (
     confidence,
     without_speckle,
 )
-from cuspid.stereo.initial_depth import initial_pairs, semi_global
-from cuspid.stereo.matching import DepthEstimator, StereoOptions, ViewSet, coarser, group_geometry
-from cuspid.stereo.rectification import IdealView, rectify
-from cuspid.stereo.refinement import (
+from cuspid.mvs.initial_depth import initial_pairs, semi_global
+from cuspid.mvs.matching import DepthEstimator, StereoOptions, ViewSet, coarser, group_geometry
+from cuspid.mvs.rectification import IdealView, rectify
+from cuspid.mvs.refinement import (
     RefinementOptions,
     detail_px,
     half_window,
@@ -38,7 +37,8 @@ from cuspid.stereo.refinement import (
     patch_window,
     window_size,
 )
-from cuspid.workers import map_in_threads
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.workers import map_in_threads
 from synthetic_scene import cast_depth, diamond, height_field, render
 
 HILLS = height_field(lambda x, y: 5 + 0.25 * np.sin(1.8 * x) * np.cos(1.5 * y))
@@ -235,7 +235,7 @@ def test_the_same_images_give_the_same_depth(alone: bool) -> None:
 
 def test_what_frames_have_in_common_is_prepared_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Even where many threads begin at once."""
-    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: 8)
+    monkeypatch.setattr("cuspid.runtime.workers.usable_cores", lambda: 8)
     prepared, together, prepare = [], Barrier(8), DepthEstimator._prepare
 
     def told(self: DepthEstimator, rig: Rig) -> tuple[ViewSet, ...]:

@@ -10,29 +10,29 @@ import numpy as np
 import pytest
 
 from cuspid import storage
-from cuspid.arch_curve import arch_curve
-from cuspid.camera import Camera
-from cuspid.capture import Capture
 from cuspid.cli import main
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.image_sequence import ImageSequence
-from cuspid.jaw import GUM, Jaw
-from cuspid.motion.single import SingleOptions, locate_single, mouth_share, normalise_contrast
-from cuspid.panorama import Panorama
-from cuspid.panorama_pipeline import StitchOptions, stitch, that_show_something
-from cuspid.pipeline import RenderOptions, take_images
-from cuspid.reconstruction import Tracks
+from cuspid.model.arch_curve import arch_curve
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Capture
+from cuspid.model.image_sequence import ImageSequence
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.panorama import Panorama
+from cuspid.model.reconstruction import Tracks
+from cuspid.model.sparse_model import SparseModel
+from cuspid.model.trueness import GroundTruth
+from cuspid.motion.monocular.single import SingleOptions, locate_single, mouth_share, normalise_contrast
+from cuspid.pipeline.panorama import StitchOptions, stitch, that_show_something
+from cuspid.pipeline.scan import RenderOptions, take_images
+from cuspid.runtime.errors import InputError, ReconstructionError
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
-from cuspid.sparse_model import SparseModel
 from cuspid.stitching.gain_compensation import GainOptions, Samples, balance
 from cuspid.stitching.height_map import HeightMapOptions, ScaleOptions, height_map, in_occlusal_frame
 from cuspid.stitching.mosaic import unlit
 from cuspid.stitching.ortho import Stitched
 from cuspid.stitching.plane_sweep import PlaneSweepOptions
 from cuspid.stitching.seams import SeamOptions, choose
-from cuspid.trueness import GroundTruth
 from verbs import refused
 
 FRAMES = 12
@@ -140,7 +140,7 @@ def test_overlaps_inliers_and_notes_are_told(stitched: Stitched) -> None:
 def test_a_path_that_the_surface_does_not_hold_stays_and_a_note_tells(
     sequence: ImageSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cuspid.panorama_pipeline.that_show_something", tuple)  # there is no picture without a surface
+    monkeypatch.setattr("cuspid.pipeline.panorama.that_show_something", tuple)  # there is no picture without a surface
     options = StitchOptions(plane_sweep=PlaneSweepOptions(agreement=0.99))
     (made,) = stitch(sequence, options)
     assert all(frame.used for frame in made.panorama.frames)

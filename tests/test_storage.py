@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 
 from builders import CAMERA, box_mesh, handpiece, image_path, make_capture, rig_of, shifted
 from cuspid import storage
-from cuspid.body import Body, Box
-from cuspid.capture import Dropped
-from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import LENSES
-from cuspid.jaw import Jaw, Landmark, Sphere
-from cuspid.reconstruction import DepthMap, Expectation, Reconstruction, Refinement
-from cuspid.rig import MountedCamera, Rig, Sensor
-from cuspid.shape_model import MeanStep
+from cuspid.model.body import Body, Box
+from cuspid.model.capture import Dropped
+from cuspid.model.jaw import Jaw, Landmark, Sphere
+from cuspid.model.reconstruction import DepthMap, Expectation, Reconstruction, Refinement
+from cuspid.model.rig import MountedCamera, Rig, Sensor
+from cuspid.model.shape_model import MeanStep
+from cuspid.model.trueness import ReferenceRender
+from cuspid.runtime.errors import CuspidError, InputError, OutputError
 from cuspid.storage.files import as_declared, read_arrays, whole_files, write_arrays
 from cuspid.storage.handpieces import camera_from_json, hash_handpiece
-from cuspid.trueness import ReferenceRender
 from strategies import lenses, rigid3s
 
 

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from cuspid.capture import Capture, Frame
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3, unit
-from cuspid.mesh import Mesh
-from cuspid.motion.expectation import expectation_of
-from cuspid.motion.held_calibration import depth_sigma_mm
-from cuspid.motion.surface_tracking import SurfaceTrackingOptions, _drift, _register_icp, adjusted, track_surfaces
-from cuspid.motion.surfaces import OrientedPoints, Surface, surface_of
-from cuspid.progress import silent
-from cuspid.reconstruction import DepthMap, Reconstruction
-from cuspid.rig import Handpiece, Light
-from cuspid.stereo.matching import coarser
-from cuspid.tolerances import NominalOptions, held
+from cuspid.model.capture import Capture, Frame
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import DepthMap, Reconstruction
+from cuspid.model.rig import Handpiece, Light
+from cuspid.model.tolerances import NominalOptions, held
+from cuspid.motion.bundle.expectation import expectation_of
+from cuspid.motion.bundle.held_calibration import depth_sigma_mm
+from cuspid.motion.icp.surface_tracking import SurfaceTrackingOptions, _drift, _register_icp, adjusted, track_surfaces
+from cuspid.motion.icp.surfaces import OrientedPoints, Surface, surface_of
+from cuspid.mvs.matching import coarser
+from cuspid.runtime.errors import ReconstructionError
+from cuspid.runtime.progress import silent
 from plain_scene import SIZE_PX
 from synthetic_scene import cast_depth, diamond, height_field
 from test_any_rig import InMemory, times

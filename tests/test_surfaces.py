@@ -10,9 +10,9 @@ import trimesh
 
 from cuspid.anatomy.landmarks.scheme import kind_of
 from cuspid.anatomy.surfaces import SURFACES, SurfaceOptions, named_surfaces, tooth_axes
-from cuspid.errors import InputError
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 
 SIDES = ("lingual", "mesial", "distal")
 

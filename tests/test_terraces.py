@@ -9,15 +9,15 @@ import trimesh
 
 from boards import BOARD, SIZE, options, scene, views_of
 from cuspid import storage
-from cuspid.board import Board
 from cuspid.calibration.calibrate import RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.start import first_camera
 from cuspid.calibration.target import PLATE_MM, target_body
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, essential_four
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.board_images import PhotographOptions, _first_hits, board_light, board_poses, take_photographs
 from cuspid.simulation.raycast import pixel_rays
 from verbs import refused, run

@@ -10,9 +10,9 @@ import trimesh
 from builders import any_pose
 from cuspid.anatomy.jaw_files import load_landmarked_jaw
 from cuspid.anatomy.tooth_colors import face_colors_of, number_regions, tooth_regions
-from cuspid.errors import InputError
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 from horseshoe import horseshoe
 
 

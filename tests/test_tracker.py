@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from cuspid.geometry import Rigid3
+from cuspid.model.rig import Handpiece
 from cuspid.motion import MotionOptions
-from cuspid.motion.features import Features
+from cuspid.motion.frontend.features import Features
 from cuspid.motion.tracker import Placed, Tracker
-from cuspid.rig import Handpiece
 from test_closure import there_and_back, without_far_sight
 from test_odometry import Keypoints, blanked, make_handpiece, make_path, see
 

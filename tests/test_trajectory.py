@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuspid.errors import InputError
 from cuspid.evaluation.trajectory import trajectory_error
 from cuspid.geometry import Rigid3
+from cuspid.runtime.errors import InputError
 from strategies import rigid3s
 
 

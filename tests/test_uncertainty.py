@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cuspid.calibration.uncertainty import projection_sigma_px
-from cuspid.camera import Camera
+from cuspid.model.camera import Camera
 
 CAMERA = replace(Camera.from_field_of_view(320, 240, 50.0), distortion=np.array([-0.1, 0.02, 1e-3, -1e-3]))
 SIGMA = np.array([0.8, 0.8, 0.6, 0.6, 4e-3, 4e-3, 5e-4, 5e-4])

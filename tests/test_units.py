@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from builders import any_pose
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.cli import main
-from cuspid.errors import InputError
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
+from cuspid.pipeline import scan as pipeline
+from cuspid.runtime.errors import InputError
 from horseshoe import horseshoe, without_base
 
 JAW = horseshoe(120, 40).mesh

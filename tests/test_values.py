@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid import cli, storage
-from cuspid.capture import Frame
-from cuspid.errors import InputError
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.rig import Rig
-from cuspid.values import checked_name, covariance, number, numbers, shown, whole
+from cuspid.model.capture import Frame
+from cuspid.model.rig import Rig
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name, covariance, number, numbers, shown, whole
 
 BAD_NAMES = [
     *("", ".", "..", "../../x", "/etc/x", "a//b", "a/", "a/../b", "C:x", "a\\b", " a", "a\n", "a\0", "a\x1b[2J"),

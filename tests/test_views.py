@@ -15,25 +15,25 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from cuspid import cli, storage
-from cuspid.capture import Capture, Frame, ImageFolder, read_mask
-from cuspid.errors import InputError, ReconstructionError
+from cuspid.fusion.cleaning import CleaningOptions
+from cuspid.fusion.depth_fusion import FusionOptions
+from cuspid.fusion.sharp_edges import SharpEdgeOptions
+from cuspid.fusion.stage import fuse
 from cuspid.geometry import Rigid3
-from cuspid.motion.features import detect
-from cuspid.pipeline import ReconstructionOptions, _hold_what_fits
-from cuspid.reconstruction import DepthMap, Funnel, Reconstruction, sum_funnels
-from cuspid.rig import Handpiece, MountedCamera, Rig
-from cuspid.stereo import DepthEstimator, StereoOptions
-from cuspid.stereo.confidence import ConfidenceOptions, Resolution, without_speckle
-from cuspid.stereo.matching import find_weak_texture, group_geometry
-from cuspid.stereo.rectification import IdealView
-from cuspid.stereo.refinement import image_noise
-from cuspid.stereo.regularised import even_out, sweep
-from cuspid.stereo.view_stage import measure_view_depth
-from cuspid.surface.cleaning import CleaningOptions
-from cuspid.surface.fusion import FusionOptions
-from cuspid.surface.sharp_edges import SharpEdgeOptions
-from cuspid.surface.stage import fuse
-from cuspid.tolerances import NominalOptions
+from cuspid.model.capture import Capture, Frame, ImageFolder, read_mask
+from cuspid.model.reconstruction import DepthMap, Funnel, Reconstruction, sum_funnels
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.tolerances import NominalOptions
+from cuspid.motion.frontend.features import detect
+from cuspid.mvs import DepthEstimator, StereoOptions
+from cuspid.mvs.confidence import ConfidenceOptions, Resolution, without_speckle
+from cuspid.mvs.matching import find_weak_texture, group_geometry
+from cuspid.mvs.rectification import IdealView
+from cuspid.mvs.refinement import image_noise
+from cuspid.mvs.regularised import even_out, sweep
+from cuspid.mvs.view_stage import measure_view_depth
+from cuspid.pipeline.scan import ReconstructionOptions, _hold_what_fits
+from cuspid.runtime.errors import InputError, ReconstructionError
 from synthetic_scene import cast_depth, diamond, height_field, render
 from test_any_rig import InMemory, scan
 
@@ -108,7 +108,7 @@ def test_what_is_masked_out_has_no_depth(tmp_path: Path) -> None:
 def test_views_that_were_measured_are_not_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = measured(tmp_path, list(around()))
     (tmp_path / "02.npz").unlink()  # as of a run that was killed
-    monkeypatch.setattr("cuspid.stereo.matching.refine", None)
+    monkeypatch.setattr("cuspid.mvs.matching.refine", None)
     again = measured(tmp_path, list(around()))
     assert np.array_equal(first["02"].depth_mm, again["02"].depth_mm, equal_nan=True)
 

@@ -11,16 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from builders import joined, moved, plate, sphere
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, twelve_cameras
 from cuspid.handpiece.optics import in_focus
 from cuspid.handpiece.presets import PRESETS
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, MountedCamera, Rig
-from cuspid.visibility import (
+from cuspid.model.camera import Camera
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, MountedCamera, Rig
+from cuspid.model.visibility import (
     VisibilityOptions,
     camera_rows,
     openness,
@@ -30,6 +29,7 @@ from cuspid.visibility import (
     visible_counts,
     visible_faces,
 )
+from cuspid.runtime.errors import InputError
 
 CAMERA = Camera.from_field_of_view(500, 500, 62.0)
 DEPTHS = (2.5, 9.0)

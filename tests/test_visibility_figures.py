@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 
 from builders import sphere
-from cuspid.reporting.figures.visibility import (
+from cuspid.report.figures.visibility import (
     COUNT_COLOURS,
     SURFACE_COLOURS,
     save_counts_picture,

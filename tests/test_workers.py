@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from cuspid.workers import (
+from cuspid.runtime.workers import (
     computed_once,
     core_numbers,
     in_shares,
@@ -158,7 +158,7 @@ def test_a_system_without_affinity_lends_all_cores(monkeypatch):
 
 def test_what_many_threads_ask_for_at_once_is_computed_once(monkeypatch):
     """Since Python 3.12, functools' own cached property is not."""
-    monkeypatch.setattr("cuspid.workers.usable_cores", lambda: 8)
+    monkeypatch.setattr("cuspid.runtime.workers.usable_cores", lambda: 8)
     computed, together = [], threading.Barrier(8)
 
     class Answer:

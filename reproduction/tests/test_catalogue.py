@@ -7,7 +7,7 @@ from string import Formatter
 import numpy as np
 import pytest
 
-from cuspid.errors import InputError
+from cuspid.runtime.errors import InputError
 from cuspid_thesis.catalogue import BY_ID, ITEMS, TABLE_3_2, MadeRows, Row, read_items
 from cuspid_thesis.computed import FIGURES, ROWS, TABLES
 from cuspid_thesis.judging import judge

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from cuspid import storage
 from cuspid.cli import main
-from cuspid.errors import CuspidError, InputError
+from cuspid.runtime.errors import CuspidError, InputError
 from cuspid_thesis import runs
 from cuspid_thesis.catalogue import BY_ID, ITEMS, TABLE_3_2
 from cuspid_thesis.checks import cameras, mouth

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from builders import write_frames
 from cuspid import cli, storage
-from cuspid.camera import Camera
-from cuspid.errors import InputError, ReconstructionError
-from cuspid.panorama import Panorama
-from cuspid.panorama_pipeline import StitchOptions, stitch
+from cuspid.model.camera import Camera
+from cuspid.model.panorama import Panorama
+from cuspid.pipeline.panorama import StitchOptions, stitch
+from cuspid.runtime.errors import InputError, ReconstructionError
 from cuspid_thesis.stitching.examination import ExaminationOptions, examine, frame_corners, inner_angles_deg, warp
 from cuspid_thesis.stitching.method import ThesisOptions, stitch_as_thesis
 from cuspid_thesis.stitching.normal_map import normal_map, rectify

@@ -13,8 +13,8 @@ from importlib import import_module
 
 import lazy_loader
 
-from cuspid.display import draw_with
+from cuspid.runtime.display import draw_with
 
 __version__ = "0.2.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-draw_with(lambda value: import_module("cuspid.reporting.notebook").to_html(value))
+draw_with(lambda value: import_module("cuspid.report.notebook").to_html(value))

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from cuspid.memory import keep_freed
+from cuspid.runtime.memory import keep_freed
 
 
 @contextmanager

@@ -13,8 +13,8 @@ from importlib import resources
 from types import MappingProxyType
 from typing import Any, Literal
 
-from cuspid.errors import InputError
-from cuspid.values import shown
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import shown
 from cuspid_thesis.results import CHECKED
 from cuspid_thesis.rules import RULES, Equals, Rule
 

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from cuspid import storage
 from cuspid.cli.shared import console, show_progress
-from cuspid.errors import CuspidError, InputError
-from cuspid.options import WORKERS
-from cuspid.reporting.pages.page import photo_uri
+from cuspid.report.pages.page import photo_uri
+from cuspid.runtime.errors import CuspidError, InputError
+from cuspid.runtime.options import WORKERS
 from cuspid.studies.grid import check_workers
 from cuspid_thesis.catalogue import BY_ID, ITEMS, Item
 from cuspid_thesis.judging import judge

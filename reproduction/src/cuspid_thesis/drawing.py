@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cuspid.reporting.figures.drawing import new_figure, save_figure
+from cuspid.report.figures.drawing import new_figure, save_figure
 
 _INK, _THESIS, _OURS = "#333333", "#9aa7b3", "#0b6e78"
 

@@ -13,7 +13,7 @@ from functools import partial
 from inspect import signature
 from typing import Any
 
-from cuspid.errors import InputError
+from cuspid.runtime.errors import InputError
 from cuspid_thesis.catalogue import ITEMS, Item, Note, Row
 from cuspid_thesis.computed import FIGURES, ROWS, TABLES
 from cuspid_thesis.page_format import Table

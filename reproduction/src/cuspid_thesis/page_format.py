@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
-from cuspid.reporting.pages.page import render_page
+from cuspid.report.pages.page import render_page
 
 Table = tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]
 """Headings, and rows of cells."""

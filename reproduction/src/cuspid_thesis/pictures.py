@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cuspid.anatomy.mouth import OPENINGS, MouthOptions, sagittal_view
-from cuspid.reporting.figures.mouth import save_sagittal_picture
+from cuspid.report.figures.mouth import save_sagittal_picture
 from cuspid_thesis.catalogue import TABLE_3_2
 from cuspid_thesis.computed.panoramas import canvas_ssim, panoramas
 from cuspid_thesis.drawing import save_ssim_picture, save_trueness_picture

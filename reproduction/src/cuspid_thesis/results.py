@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from string import Formatter
 from typing import Any
 
-from cuspid.errors import InputError
-from cuspid.values import shown
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import shown
 
 Result = Mapping[str, Any]
 Results = Mapping[str, Result]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from cuspid.errors import InputError
-from cuspid.values import shown
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import shown
 
 Verdict = Literal["better", "reproduced", "differs", "falls short", "not run", "not known"]
 """``not run``: we have no figure yet. ``not known``: what the thesis shows is lost in our copy."""

@@ -29,14 +29,14 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GroupName, draw_population
 from cuspid.anatomy.shape.boxed import boxed
-from cuspid.errors import CuspidError, InputError
 from cuspid.handpiece.designs import twelve_cameras
-from cuspid.progress import Progress, silent
-from cuspid.reporting.figures.drawing import save_picture
+from cuspid.report.figures.drawing import save_picture
+from cuspid.runtime.errors import CuspidError, InputError
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import usable_cores
 from cuspid.studies.camera_pair import CameraPairOptions
 from cuspid.studies.camera_sweep import SweepOptions
 from cuspid.studies.grid import Case, Value, run_grid
-from cuspid.workers import usable_cores
 from cuspid_thesis.catalogue import Item
 from cuspid_thesis.checks import CHECKS
 from cuspid_thesis.computed.panoramas import EXAMINED, SUBJECTS, UNEXAMINED, panoramas

@@ -16,15 +16,15 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GROUPS, Group, GroupName, draw_and_count, draw_population
 from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape
 from cuspid.anatomy.surfaces import named_surfaces
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, twelve_cameras
-from cuspid.jaw import Jaw, Landmark
-from cuspid.rig import Handpiece
-from cuspid.shape_model import ShapeModel
+from cuspid.model.jaw import Jaw, Landmark
+from cuspid.model.rig import Handpiece
+from cuspid.model.shape_model import ShapeModel
+from cuspid.model.visibility import VisibilityOptions, surface_rows, survey_visibility
+from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 from cuspid.studies.camera_pair import CameraPairOptions, best_pairs, study_camera_pair
-from cuspid.visibility import VisibilityOptions, surface_rows, survey_visibility
 
 MEAN_GROUP: GroupName = "lower-14"
 """Whose mean shape is found."""

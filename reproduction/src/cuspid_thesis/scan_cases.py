@@ -22,9 +22,9 @@ from typing import IO
 
 import cuspid
 from cuspid.cli.verbs import RENAMED
-from cuspid.errors import CuspidError
+from cuspid.runtime.errors import CuspidError
+from cuspid.runtime.workers import usable_cores
 from cuspid.storage.files import open_to_append
-from cuspid.workers import usable_cores
 
 PACKAGES = ("cuspid", "numpy", "numba", "opencv-contrib-python-headless", "pycolmap", "embreex", "libigl")
 """Whose versions are kept with every result."""

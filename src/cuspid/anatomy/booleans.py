@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.anatomy.edges import describe_edges, loops_of, open_edges
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 
 CAVITY = 1
 """Mark of the faces of a tool that leave prepared tooth."""

@@ -25,9 +25,9 @@ from scipy.spatial import cKDTree
 
 from cuspid.anatomy.edges import open_edges
 from cuspid.geometry import read_only, unit
-from cuspid.graph import parts_of
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh, edges_of
+from cuspid.geometry.graph import parts_of
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh, edges_of
 
 _FACE_MM2, _COARSE_FACE_MM2 = 0.3, 1.2
 """Mean area of the faces of the surface that is walked, and of the one that tells what stands out."""

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int
 
-from cuspid.mesh import edges_of
+from cuspid.model.mesh import edges_of
 
 
 def open_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:

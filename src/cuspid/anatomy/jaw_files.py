@@ -14,12 +14,12 @@ from cuspid.anatomy.landmarks.scheme import in_frame, missing, validate
 from cuspid.anatomy.numbering import Numbered, Numbering, number_teeth
 from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, require_one_jaw
 from cuspid.anatomy.tooth_colors import face_colors_of, number_regions, tooth_regions
-from cuspid.errors import InputError
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
-from cuspid.inputs import is_there
-from cuspid.jaw import ARCHES, Arch, Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.facing import facing_outwards
+from cuspid.model.jaw import ARCHES, Arch, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import is_there
 from cuspid.storage.files import finished, reading
 from cuspid.storage.jaws import is_jaw, read_label_map, read_labelled_mesh
 from cuspid.storage.jaws import read_jaw as read_own_jaw

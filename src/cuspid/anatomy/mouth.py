@@ -28,9 +28,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS, QUADRANTS
-from cuspid.errors import InputError
-from cuspid.options import SEED, Options, Range
-from cuspid.workers import computed_once
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SEED, Options, Range
+from cuspid.runtime.workers import computed_once
 
 Sizes = float | Float[np.ndarray, "*n"]
 """A value for one person, or one for each of many."""

@@ -18,9 +18,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.errors import InputError
-from cuspid.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 
 Numbering = Literal["auto", "fdi", "universal", "along-arch"]
 """What the labels of a file may be said to be."""

@@ -4,7 +4,7 @@ The outside of a scan tells where the crowns point: an open surface by the mean 
 side that is not smooth. Seen from there the tips of the crowns give the occlusal plane, the symmetry of the crowns the
 midline, and their spread across it which end is anterior.
 
-Frames: ``occlusal`` as in :mod:`cuspid.jaw`: origin in the middle of the crowns at the mean height of their tips.
+Frames: ``occlusal`` as in :mod:`cuspid.model.jaw`: origin in the middle of the crowns at the mean height of their tips.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import uniform_filter
 from scipy.spatial import ConvexHull, cKDTree
 
-from cuspid.errors import InputError
-from cuspid.facing import pieces_of
 from cuspid.geometry import Rigid3, axes_about, best_similarity, unit
-from cuspid.mesh import Mesh
-from cuspid.occlusal_plane import crown_tips, crown_tops, levelled, upright
+from cuspid.model.facing import pieces_of
+from cuspid.model.mesh import Mesh
+from cuspid.model.occlusal_plane import crown_tips, crown_tops, levelled, upright
+from cuspid.runtime.errors import InputError
 from cuspid.storage import MM_PER_UNIT, Unit
 
 _GRID_MM = 0.5

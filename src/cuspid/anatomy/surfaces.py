@@ -25,10 +25,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from cuspid.anatomy.landmarks.scheme import kind_of
-from cuspid.errors import InputError
 from cuspid.geometry import unit
-from cuspid.jaw import Jaw
-from cuspid.options import Options, Range
+from cuspid.model.jaw import Jaw
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 SURFACES = ("occlusal", "incisal", "buccal", "labial", "lingual", "mesial", "distal", "gingival")
 """Names of the surfaces, in the order of tables."""

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 
-from cuspid.jaw import GUM, Arch
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, Arch
+from cuspid.model.mesh import Mesh
 
 Colors = UInt8[np.ndarray, "f 3"]
 

@@ -16,7 +16,7 @@ from typing import TypeGuard
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.board import Board, Target
+from cuspid.model.board import Board, Target
 
 _MOST_NODES = 14
 """Along each side of a board."""

@@ -30,15 +30,15 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
-from cuspid.board import Board, Target
 from cuspid.calibration.board_shape import BoardShape, nodes_of
 from cuspid.calibration.corners import BoardView, Views
 from cuspid.calibration.scatter import covariance_of, influences
-from cuspid.camera import Camera
-from cuspid.epipolar import skew
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera
+from cuspid.model.board import Board, Target
+from cuspid.model.camera import Camera
+from cuspid.model.epipolar import skew
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import ReconstructionError
 
 _PLACE, _BENDING = 6, 3
 _LENSES, _CAMERAS, _BOARDS, _BENDINGS, _SHAPES, _MOUNTS, _CAMERA_DELAYS, _READOUTS, _VIEW_DELAYS = range(9)

@@ -12,7 +12,6 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration.board_shape import BoardShape, is_grid_of_corners
 from cuspid.calibration.bundle import (
     Adjusted,
@@ -34,12 +33,13 @@ from cuspid.calibration.joining import joined_boards
 from cuspid.calibration.lenses import LensChoice, LensName, choose_lens
 from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, renumbered, require_one_group
 from cuspid.calibration.timing import adjust_scene, follow_each_other, rolling, untied
-from cuspid.camera import Camera
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.options import Options, Range
-from cuspid.rig import MountedCamera, Rig
-from cuspid.shutter import Shutter, frame_numbers
+from cuspid.model.board import Board, BoardSet, Target
+from cuspid.model.camera import Camera
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.model.shutter import Shutter, frame_numbers
+from cuspid.runtime.errors import InputError, ReconstructionError
+from cuspid.runtime.options import Options, Range
 
 _DOUBTFUL = 2.0
 """Difference between two halves, in standard deviations, that chance hardly explains."""

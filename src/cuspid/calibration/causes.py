@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration.circle_centres import seen_grid
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.lattice import find_lattice
 from cuspid.calibration.tag_corners import ABOVE, detect_tags, layout_agreement, tag_beside
-from cuspid.errors import InputError
+from cuspid.model.board import Board, BoardSet, Target
+from cuspid.runtime.errors import InputError
 
 MOST_TRIED = 6
 """Images in which a cause is looked for."""

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from cuspid.board import Board, BoardKind
 from cuspid.calibration.lattice import Cell, openings
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
+from cuspid.model.board import Board, BoardKind
+from cuspid.model.camera import Camera
 
 _WINDOWS = (0.04, 0.12)
 """Sides of the windows in which brightness is compared, as shares of the larger side of the image."""

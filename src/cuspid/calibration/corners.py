@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from cuspid.board import Board, BoardKind, BoardSet, Target
 from cuspid.calibration.circle_centres import find_circles
 from cuspid.calibration.lattice import find_lattice, is_as_large, is_larger
 from cuspid.calibration.tag_corners import find_tag_corners
-from cuspid.camera import OPENCV_PIXEL_OFFSET
+from cuspid.model.board import Board, BoardKind, BoardSet, Target
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET
 
 LEAST_CORNERS = 6
 """Minimum number of corners in a usable view."""

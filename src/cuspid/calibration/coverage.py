@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.board import Target
 from cuspid.calibration.corners import BoardView, pieces
 from cuspid.calibration.start import groups
-from cuspid.options import Options, Range
+from cuspid.model.board import Target
+from cuspid.runtime.options import Options, Range
 
 CELLS = 6
 """Of an image, each way."""

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig, in_frame_of, size_notes
 from cuspid.calibration.causes import MOST_TRIED, cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.circle_centres import measured_share
@@ -18,12 +17,13 @@ from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.instants import common_instants
 from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
 from cuspid.calibration.start import LEAST_VIEWS
-from cuspid.errors import ReconstructionError
-from cuspid.image_sequence import ImageSequence
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece, depth_of_field_mm
-from cuspid.values import named
-from cuspid.workers import map_in_threads
+from cuspid.model.board import Board, BoardSet, Target
+from cuspid.model.image_sequence import ImageSequence
+from cuspid.model.rig import Handpiece, depth_of_field_mm
+from cuspid.runtime.errors import ReconstructionError
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.values import named
+from cuspid.runtime.workers import map_in_threads
 
 _OTHER_CIRCLES = 0.06
 """Error of the diameter of circles, as a share, that is told."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-from cuspid.errors import InputError
+from cuspid.runtime.errors import InputError
 
 _DIGITS = re.compile(r"\d+")
 

@@ -18,14 +18,14 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.board import BoardSet
 from cuspid.calibration.agreement import agreed_on
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.corners import BoardView, Views, split_by_board
 from cuspid.calibration.start import board_pose
-from cuspid.camera import Camera
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
+from cuspid.model.board import BoardSet
+from cuspid.model.camera import Camera
+from cuspid.runtime.errors import InputError, ReconstructionError
 
 _LEAST_INSTANTS, _LEAST_TURN_DEG = 4, 6.0
 """Instants, and turns about the second of two axes (RMS), that join cameras by motion."""

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from cuspid.board import Board
 from cuspid.geometry import unit
+from cuspid.model.board import Board
 
 _SIGMA_PX = 1.2
 """Standard deviation of the blur before derivatives are taken."""

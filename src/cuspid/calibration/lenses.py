@@ -15,13 +15,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.board import Target
 from cuspid.calibration.bundle import Adjusted, adjust_board, in_front, of_instants
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone
-from cuspid.camera import Camera
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry.cameras import MODELS
+from cuspid.model.board import Target
+from cuspid.model.camera import Camera
+from cuspid.runtime.errors import InputError, ReconstructionError
 
 LensName = Literal["auto", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"]
 """A model, or the one that the images call for."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.calibration.patches import FREEDOM, Patches
-from cuspid.rig import MID_GREY_DN, Sensor
+from cuspid.model.rig import MID_GREY_DN, Sensor
 
 _ROUNDING_DN2 = 1 / 12
 """Variance that rounding to whole numbers adds."""
@@ -19,7 +19,7 @@ _TOO_MUCH = 4.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Noise:
-    """Variance that grows with the level, as in :class:`cuspid.rig.Sensor`."""
+    """Variance that grows with the level, as in :class:`cuspid.model.rig.Sensor`."""
 
     read_dn2: float
     """Variance at level 0, including rounding."""
@@ -34,12 +34,12 @@ class Noise:
 
     @property
     def noise_dn(self) -> float:
-        """See :attr:`cuspid.rig.Sensor.noise_dn`."""
+        """See :attr:`cuspid.model.rig.Sensor.noise_dn`."""
         return float(np.sqrt(max(self.read_dn2 + self.per_dn * MID_GREY_DN - _ROUNDING_DN2, 0.0)))
 
     @property
     def shot_noise_share(self) -> float:
-        """See :attr:`cuspid.rig.Sensor.shot_noise_share`."""
+        """See :attr:`cuspid.model.rig.Sensor.shot_noise_share`."""
         if not self.noise_dn:
             return Sensor().shot_noise_share
         return float(np.clip(self.per_dn * MID_GREY_DN / self.noise_dn**2, 0, 1))

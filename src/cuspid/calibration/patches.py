@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from cuspid.board import Board
 from cuspid.calibration.bundle import bent
-from cuspid.camera import Camera
 from cuspid.geometry import Rigid3
-from cuspid.options import Options, Range
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
+from cuspid.runtime.options import Options, Range
 
 BRIGHTEST_DN, DARKEST_DN = 245.0, 8.0
 """Beyond these levels, a mean may have been clipped."""

@@ -13,7 +13,6 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from cuspid.board import Board
 from cuspid.calibration.bundle import bending_coordinates
 from cuspid.calibration.calibrate import RigCalibration, known
 from cuspid.calibration.noise import Noise, noise_of
@@ -40,10 +39,11 @@ from cuspid.calibration.shading import (
     polynomials,
     prior,
 )
-from cuspid.options import Range
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece, Light, Sensor, falloff_terms
-from cuspid.workers import map_in_threads
+from cuspid.model.board import Board
+from cuspid.model.rig import Handpiece, Light, Sensor, falloff_terms
+from cuspid.runtime.options import Range
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import map_in_threads
 
 Image = UInt8[np.ndarray, "h w 3"]
 ViewPatches = Mapping[tuple[str, str], Patches]
@@ -112,7 +112,7 @@ class CameraLight:
     noise_sigma_dn: float
     """Standard deviation of that value."""
     shot_noise_share: float
-    """See :attr:`cuspid.rig.Sensor.shot_noise_share`."""
+    """See :attr:`cuspid.model.rig.Sensor.shot_noise_share`."""
     before_pct: float
     """RMS of the residuals, relative to the grey value, for identical cameras without falloff and lights as drawn."""
     after_pct: float

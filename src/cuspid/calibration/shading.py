@@ -1,9 +1,9 @@
 """The response of the cameras to light, and the lights themselves, in one adjustment.
 
 A patch of a board shows a grey value y, of which ``gamma_c log(y / 255)`` is a sum of logarithms of linear light: a
-level common to all, the loss by ink, ``log g_c + a_c r^2 + b_c r^4`` of the camera (:class:`cuspid.rig.Sensor`),
-``log E(X)`` of the lights that are on (:meth:`cuspid.rig.Light.irradiance`), and a polynomial in the place (u, v) on
-the board at this instant, by which the light differs from that: a diffuse (Lambertian) surface looks equally bright
+level common to all, the loss by ink, ``log g_c + a_c r^2 + b_c r^4`` of the camera (:class:`cuspid.model.rig.Sensor`),
+``log E(X)`` of the lights that are on (:meth:`cuspid.model.rig.Light.irradiance`), and a polynomial in the place (u, v)
+on the board at this instant, by which the light differs from that: a diffuse (Lambertian) surface looks equally bright
 from all sides, so all cameras share it. If no lights are known, it alone is the light, of degree 4 and free. If they
 are, it is of degree 2 and small, and how small is estimated with the rest (D. J. C. MacKay, Neural Computation 4,
 1992): it absorbs errors of the poses of the board, which all patches of an instant share.
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.rig import Light
+from cuspid.model.rig import Light
 
 PER_CAMERA, PER_LIGHT = 4, 4
 _COMMON = 2

@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.board import Target
 from cuspid.calibration.agreement import agreed_on, apart
 from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, in_front, of_instants
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, pieces
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.errors import InputError, ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.graph import parts_of
+from cuspid.geometry.graph import parts_of
+from cuspid.model.board import Target
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.runtime.errors import InputError, ReconstructionError
 
 LEAST_VIEWS = 3
 """A camera that saw the board at fewer instants cannot be calibrated."""

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from cuspid.board import Board
-from cuspid.board.tags import TagGrid, tag_dictionary
+from cuspid.model.board import Board
+from cuspid.model.board.tags import TagGrid, tag_dictionary
 
 _WINDOWS_PX = (3, 43, 4)
 """Sides of the windows in which brightness is compared: the smallest, the largest, and the step between them."""

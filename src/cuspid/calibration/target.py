@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from manifold3d import CrossSection, Manifold
 
-from cuspid.board import Board
-from cuspid.mesh import Mesh
+from cuspid.model.board import Board
+from cuspid.model.mesh import Mesh
 
 PLATE_MM = 2.0
 """Thickness of the body below the first terrace."""

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-from cuspid.board import Target
 from cuspid.calibration.bundle import Adjusted, BoardScene, Timing, adjust_board
 from cuspid.calibration.corners import Views
 from cuspid.geometry import Rigid3
+from cuspid.model.board import Target
 
 _REACH = 2
 """How many frames away a neighbour may be."""

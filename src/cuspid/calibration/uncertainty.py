@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from cuspid.camera import Camera
+from cuspid.model.camera import Camera
 
 _STEP_PX, _STEP = 1e-3, 1e-6
 """Steps of the differences: of focal lengths and principal point, and of distortion and rotations."""

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_type_hints
 
 from cuspid import __version__
 from cuspid.cli.verbs import GROUPS, VERBS, overview, reject_unknown, split_verb
-from cuspid.errors import CuspidError
-from cuspid.plugins import load_plugin
+from cuspid.runtime.errors import CuspidError
+from cuspid.runtime.plugins import load_plugin
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -58,7 +58,7 @@ def load(arguments: Sequence[str]) -> None:
 
 def check_options_of(verb: str) -> Callable[..., None]:
     """The function of a verb, which checks its own numbers before it begins."""
-    from cuspid.options import check
+    from cuspid.runtime.options import check
 
     command = COMMANDS[verb]
 

@@ -12,7 +12,6 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from cuspid import storage
-from cuspid.board import Board, BoardSet, Target
 from cuspid.calibration.calibrate import (
     CalibrationOptions,
     RigCalibration,
@@ -24,16 +23,17 @@ from cuspid.calibration.target import PLATE_MM, target_body
 from cuspid.calibration.uncertainty import lens_difference_px, projection_sigma_px
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
-from cuspid.errors import InputError
-from cuspid.options import Range
-from cuspid.reporting.figures.calibration import (
+from cuspid.model.board import Board, BoardSet, Target
+from cuspid.model.rig import Handpiece, Light
+from cuspid.report.figures.calibration import (
     save_board,
     save_lenses_picture,
     save_photometry_picture,
     save_residuals_picture,
     save_uncertainty_picture,
 )
-from cuspid.rig import Handpiece, Light
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Range
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
 from cuspid.simulation.manufacturing import ManufacturingOptions, built
 

@@ -15,10 +15,10 @@ from cuspid import storage
 from cuspid.anatomy.mouth import MouthOptions, room_mm, study_mouths
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
-from cuspid.errors import InputError
-from cuspid.options import WORKERS, Range
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reporting.figures.comparison import Curve, save_comparison_picture, save_surface_shares_picture
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
+from cuspid.report.figures.comparison import Curve, save_comparison_picture, save_surface_shares_picture
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import WORKERS, Range
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.studies.design_comparison import (

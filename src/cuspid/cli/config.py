@@ -19,8 +19,8 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hi
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from cuspid.errors import InputError
-from cuspid.inputs import read_bytes
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import read_bytes
 from cuspid.storage.files import write_bytes
 
 READ, WRITE = "--config", "--write-config"

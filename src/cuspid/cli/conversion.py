@@ -10,8 +10,9 @@ from tyro.conf import Positional, arg
 
 from cuspid import storage
 from cuspid.cli.shared import console
-from cuspid.errors import InputError
-from cuspid.options import Range
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Range
+from cuspid.runtime.values import MOST_PX, named
 from cuspid.storage.calibrations import (
     MOST_LOST_PX,
     Loss,
@@ -21,7 +22,6 @@ from cuspid.storage.calibrations import (
     read_calibration,
     write_calibration,
 )
-from cuspid.values import MOST_PX, named
 
 
 def convert(

@@ -7,10 +7,11 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from cuspid import panorama_pipeline, storage
+from cuspid import storage
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.panorama_pipeline import FilmOptions
+from cuspid.pipeline import panorama as panorama_pipeline
+from cuspid.pipeline.panorama import FilmOptions
 
 
 def film(

@@ -17,7 +17,7 @@ from cuspid.footage.plan import Films, ImportOptions, Plan, SelectionOptions, ch
 from cuspid.footage.quality import Looks, QualityOptions
 from cuspid.footage.stage import develop, open_films, survey
 from cuspid.footage.synchronise import SyncOptions
-from cuspid.options import Range
+from cuspid.runtime.options import Range
 
 _SHOWN = 5
 """Number of frames named for each reason; import.json lists all."""

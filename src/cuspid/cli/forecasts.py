@@ -16,17 +16,17 @@ from tyro.conf import Positional, arg
 from cuspid import storage
 from cuspid.anatomy.surfaces import named_surfaces, tooth_axes
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source
-from cuspid.errors import InputError
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, PrecisionMap
 from cuspid.handpiece.presets import PRESETS
-from cuspid.jaw import Jaw
-from cuspid.options import SEED, TOOTH, Range
-from cuspid.reporting.figures.precision import save_precision_picture
-from cuspid.reporting.figures.visibility import save_counts_picture, save_surfaces_picture
+from cuspid.model.jaw import Jaw
+from cuspid.model.visibility import VisibilityOptions, camera_rows, surface_rows
+from cuspid.report.figures.precision import save_precision_picture
+from cuspid.report.figures.visibility import save_counts_picture, save_surfaces_picture
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SEED, TOOTH, Range
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.studies.forecast import bound_over, foresee
-from cuspid.visibility import VisibilityOptions, camera_rows, surface_rows
 
 VIEWS = {"occlusal": (0.0, 90.0), "from the cheek": (0.0, 15.0), "from the tongue": (180.0, 15.0)}
 """Azimuth from the buccal side of a tooth, and elevation, in degrees."""

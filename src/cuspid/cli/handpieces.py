@@ -10,17 +10,17 @@ from tyro.conf import Positional
 from cuspid import storage
 from cuspid.anatomy.mouth import MouthOptions
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
-from cuspid.errors import InputError
 from cuspid.handpiece.brief import read_brief
+from cuspid.handpiece.cad.printability import check_printable
+from cuspid.handpiece.cad.printable import printable, views_of
+from cuspid.handpiece.cad.shell import PrintOptions
 from cuspid.handpiece.designs import DesignName, DesignOptions, build_handpiece
 from cuspid.handpiece.optimise import SearchOptions, handpiece_outline
-from cuspid.handpiece.printability import check_printable
-from cuspid.handpiece.printable import printable, views_of
-from cuspid.handpiece.shell import PrintOptions
-from cuspid.options import TOOTH
-from cuspid.reporting.figures.design import save_design_picture
-from cuspid.reporting.figures.holder import save_holder_picture
-from cuspid.rig import Handpiece
+from cuspid.model.rig import Handpiece
+from cuspid.report.figures.design import save_design_picture
+from cuspid.report.figures.holder import save_holder_picture
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import TOOTH
 from cuspid.studies import forecast
 
 

@@ -25,11 +25,11 @@ from cuspid.anatomy.preparation.prepare import (
 from cuspid.anatomy.preparation.prepare import prepare as prepare_teeth
 from cuspid.anatomy.shape.boxed import boxed
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
-from cuspid.errors import InputError, OutputError
-from cuspid.jaw import Jaw
-from cuspid.options import TOOTH, Range
-from cuspid.reporting.figures.drawing import save_picture
-from cuspid.reporting.figures.preparation import save_preparation_picture
+from cuspid.model.jaw import Jaw
+from cuspid.report.figures.drawing import save_picture
+from cuspid.report.figures.preparation import save_preparation_picture
+from cuspid.runtime.errors import InputError, OutputError
+from cuspid.runtime.options import TOOTH, Range
 
 
 def phantom(

@@ -11,17 +11,17 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from cuspid import storage
-from cuspid.capture import Capture, Dropped, Frame, ImageSource
 from cuspid.cli.scan import reconstruct_capture
 from cuspid.cli.shared import Flat, console
-from cuspid.errors import CuspidError, InputError, ReconstructionError
 from cuspid.footage.arrivals import Arrivals
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
-from cuspid.pipeline import ReconstructionOptions
-from cuspid.reporting.growing_view import GrowingView
-from cuspid.rig import Handpiece
-from cuspid.session import Session, Step
+from cuspid.model.capture import Capture, Dropped, Frame, ImageSource
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
+from cuspid.pipeline.scan import ReconstructionOptions
+from cuspid.pipeline.session import Session, Step
+from cuspid.report.growing_view import GrowingView
+from cuspid.runtime.errors import CuspidError, InputError, ReconstructionError
+from cuspid.runtime.options import Options, Range
 from cuspid.storage.handpieces import hash_handpiece
 
 _POLL_S = 0.1

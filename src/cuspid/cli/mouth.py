@@ -22,8 +22,8 @@ from cuspid.anatomy.mouth import (
     study_mouths,
 )
 from cuspid.cli.shared import Flat, console
-from cuspid.errors import InputError
-from cuspid.reporting.figures.mouth import TOOTH_NAMES, save_fit_picture, save_gap_picture, save_sagittal_picture
+from cuspid.report.figures.mouth import TOOTH_NAMES, save_fit_picture, save_gap_picture, save_sagittal_picture
+from cuspid.runtime.errors import InputError
 
 
 def mouth(*, out: Path, handpiece: Path | None = None, options: Annotated[MouthOptions, Flat] = MouthOptions()) -> None:

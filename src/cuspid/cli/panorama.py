@@ -9,22 +9,23 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from cuspid import panorama_pipeline, storage
+from cuspid import storage
 from cuspid.anatomy.orientation import require_one_jaw
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
-from cuspid.errors import InputError
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
-from cuspid.image_sequence import ImageSequence
-from cuspid.motion.single import loosely_held
-from cuspid.panorama import FrameUse, Panorama
-from cuspid.panorama_pipeline import MeshViewOptions, StitchOptions
-from cuspid.progress import Progress
-from cuspid.reporting.figures.panorama import save_camera_path
+from cuspid.model.facing import facing_outwards
+from cuspid.model.image_sequence import ImageSequence
+from cuspid.model.panorama import FrameUse, Panorama
+from cuspid.motion.monocular.single import loosely_held
+from cuspid.pipeline import panorama as panorama_pipeline
+from cuspid.pipeline.panorama import MeshViewOptions, StitchOptions
+from cuspid.report.figures.panorama import save_camera_path
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.progress import Progress
+from cuspid.runtime.values import named
+from cuspid.runtime.workers import map_in_threads
 from cuspid.stitching.ortho import Stitched
-from cuspid.values import named
-from cuspid.workers import map_in_threads
 
 
 def stitch(

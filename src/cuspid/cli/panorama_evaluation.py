@@ -13,7 +13,6 @@ from tyro.conf import Positional
 from cuspid import storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console
-from cuspid.errors import InputError
 from cuspid.evaluation.panorama import (
     ImageScores,
     PanoramaComparison,
@@ -21,10 +20,11 @@ from cuspid.evaluation.panorama import (
     PanoramaScore,
     evaluate_panorama,
 )
-from cuspid.image_files import read_rgba
-from cuspid.panorama import FrameUse, Panorama
-from cuspid.reporting.figures.panorama_evaluation import save_panorama_evaluation
-from cuspid.trueness import ReferenceRender
+from cuspid.model.panorama import FrameUse, Panorama
+from cuspid.model.trueness import ReferenceRender
+from cuspid.report.figures.panorama_evaluation import save_panorama_evaluation
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import read_rgba
 
 
 def evaluate(

@@ -6,14 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from cuspid import photograph_pipeline, pipeline, storage
+from cuspid import storage
 from cuspid.cli.shared import console, show_progress
+from cuspid.model.photographs import Photographs
 from cuspid.motion.colmap import hash_sparse
-from cuspid.photograph_pipeline import LocatedPhotographs, PhotographOptions, PhotoScaleOptions
-from cuspid.photographs import Photographs
-from cuspid.pipeline import ReconstructionOptions
-from cuspid.progress import Progress
-from cuspid.reporting.figures.drawing import save_expected_picture
+from cuspid.pipeline import photographs as photograph_pipeline
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.photographs import LocatedPhotographs, PhotographOptions, PhotoScaleOptions
+from cuspid.pipeline.scan import ReconstructionOptions
+from cuspid.report.figures.drawing import save_expected_picture
+from cuspid.runtime.progress import Progress
 
 _MOST_TOLD = 12
 

@@ -16,23 +16,23 @@ from rich.table import Table
 from rich.text import Text
 
 from cuspid import storage
-from cuspid.board import Board, Target
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.coverage import Coverage, CoverageOptions, coverage_cells
 from cuspid.cli.calibration import BoardFiles, target_of
 from cuspid.cli.shared import Flat, console
-from cuspid.errors import InputError
 from cuspid.footage.cameras import CameraSource, ExposureOptions, Ready
 from cuspid.footage.devices import FormatOptions, V4L2Camera, cameras_there
 from cuspid.footage.played import FilmCamera, RenderedCamera
 from cuspid.footage.quality import look, seen
 from cuspid.footage.record import Recording, RecordOptions, Status, Together, require_names
-from cuspid.options import Options, Range
-from cuspid.reporting.preview import Preview, marked
+from cuspid.model.board import Board, Target
+from cuspid.report.preview import Preview, marked
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.values import checked_name
+from cuspid.runtime.workers import map_in_threads
 from cuspid.simulation.board_images import BoardFilm, PhotographOptions
 from cuspid.storage.videos import VIDEO_SUFFIXES
-from cuspid.values import checked_name
-from cuspid.workers import map_in_threads
 
 _REHEARSED_PER_S = 5.0
 _POSE_S = 2.0

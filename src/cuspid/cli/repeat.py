@@ -13,14 +13,14 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from cuspid import storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
-from cuspid.errors import InputError
-from cuspid.options import WORKERS
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reporting.figures.repeat import save_repeat_picture
+from cuspid.model.trueness import METRICS
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
+from cuspid.report.figures.repeat import save_repeat_picture
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import WORKERS
 from cuspid.studies.grid import check_workers
 from cuspid.studies.repetition import RepeatOptions, Repetition, repeat_scans
 from cuspid.studies.trial import TrialOptions
-from cuspid.trueness import METRICS
 
 
 def repeat(

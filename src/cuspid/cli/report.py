@@ -10,8 +10,8 @@ from tyro.conf import Positional
 
 from cuspid import storage
 from cuspid.cli.shared import Flat, console
-from cuspid.reporting.pages.report import report_page
-from cuspid.reporting.pages.scan import ReportOptions
+from cuspid.report.pages.report import report_page
+from cuspid.report.pages.scan import ReportOptions
 
 
 def report(

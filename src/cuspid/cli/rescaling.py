@@ -15,14 +15,14 @@ from cuspid import storage
 from cuspid.cli.panorama import clear, save_path_picture
 from cuspid.cli.report import report
 from cuspid.cli.shared import console
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.options import Range
-from cuspid.reporting.figures.panorama import save_distances
+from cuspid.report.figures.panorama import save_distances
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Range
+from cuspid.runtime.values import LONGEST_MM
 from cuspid.stitching.rescaling import MeasuredDistance, Rescaled, rescaled, scaled_pose
 from cuspid.storage.files import read_manifest
 from cuspid.storage.strips import read_scaled_strip, write_scaled_strip
-from cuspid.values import LONGEST_MM
 
 _LEAST_MM = 0.1
 

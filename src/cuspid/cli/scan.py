@@ -13,33 +13,34 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from cuspid import pipeline, storage
-from cuspid.capture import Capture
+from cuspid import storage
 from cuspid.cli.photographs import reconstruct_photographs
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
-from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.margin import MarginError, cut_margins, margin_error
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
 from cuspid.evaluation.trajectory import trajectory_error
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.capture import Capture
+from cuspid.model.facing import facing_outwards
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import Expectation, Reconstruction
+from cuspid.model.rig import Handpiece
+from cuspid.model.tolerances import NominalOptions, is_nominal
+from cuspid.model.trueness import METRICS, STATISTICS, DeviationStatistics, Trueness
 from cuspid.motion.colmap import hash_model
-from cuspid.motion.photographs import PhotographOptions
-from cuspid.motion.scale import PhotoScaleOptions
-from cuspid.motion.surface_tracking import glare_notes
-from cuspid.options import Range
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reconstruction import Expectation, Reconstruction
-from cuspid.reporting.figures.drawing import deviation_colors, save_deviation_picture, save_expected_picture
-from cuspid.reporting.figures.margin import save_margin_picture
-from cuspid.reporting.figures.sphere import save_sphere_picture
-from cuspid.rig import Handpiece
-from cuspid.tolerances import NominalOptions, is_nominal
-from cuspid.trueness import METRICS, STATISTICS, DeviationStatistics, Trueness
+from cuspid.motion.icp.surface_tracking import glare_notes
+from cuspid.motion.monocular.photographs import PhotographOptions
+from cuspid.motion.monocular.scale import PhotoScaleOptions
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
+from cuspid.report.figures.drawing import deviation_colors, save_deviation_picture, save_expected_picture
+from cuspid.report.figures.margin import save_margin_picture
+from cuspid.report.figures.sphere import save_sphere_picture
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Range
 
 
 def run(

@@ -19,14 +19,14 @@ from cuspid.anatomy.jaw_files import Labelling, read_jaw
 from cuspid.anatomy.numbering import Numbering
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.errors import InputError
 from cuspid.handpiece.designs import DesignName, DesignOptions, build_handpiece
-from cuspid.jaw import Arch, Jaw
-from cuspid.options import SEED, Options, Range
-from cuspid.progress import Progress
-from cuspid.rig import Handpiece
+from cuspid.model.jaw import Arch, Jaw
+from cuspid.model.rig import Handpiece
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SEED, Options, Range
+from cuspid.runtime.progress import Progress
+from cuspid.runtime.values import printable
 from cuspid.simulation.appearance import Preset
-from cuspid.values import printable
 
 
 class _Messages(Console):

@@ -14,13 +14,13 @@ from tyro.conf import Positional
 from cuspid import storage
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
-from cuspid.errors import InputError
-from cuspid.options import WORKERS
-from cuspid.reporting.figures.sweep import SweepMap, save_sweep_picture
+from cuspid.model.trueness import METRICS
+from cuspid.report.figures.sweep import SweepMap, save_sweep_picture
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import WORKERS
 from cuspid.studies.camera_sweep import TERMS, Best, Setting, SweepOptions, Term, best_setting, values_of
 from cuspid.studies.camera_sweep import sweep as run_sweep
 from cuspid.studies.grid import Outcome
-from cuspid.trueness import METRICS
 
 _TITLES: dict[Term, tuple[str, int]] = {
     "complete_50_um_pct": (METRICS["complete_50_um_pct"].label, 1),

@@ -17,11 +17,12 @@ from cuspid.anatomy.jaw_files import Labelling
 from cuspid.anatomy.numbering import Numbering
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
-from cuspid.errors import MissingDependencyError
 from cuspid.evaluation.alignments import CONSEQUENCES
-from cuspid.jaw import Arch
-from cuspid.options import WORKERS, Options, Range
-from cuspid.reporting.figures.scanner_study import save_study_figures
+from cuspid.model.jaw import Arch
+from cuspid.model.trueness import METRICS
+from cuspid.report.figures.scanner_study import save_study_figures
+from cuspid.runtime.errors import MissingDependencyError
+from cuspid.runtime.options import WORKERS, Options, Range
 from cuspid.studies.grid import check_workers
 from cuspid.studies.scanners.files import Remark
 from cuspid.studies.scanners.scan import StudyOptions
@@ -29,7 +30,6 @@ from cuspid.studies.scanners.statistics import summary as summarised
 from cuspid.studies.scanners.study import Intake, Prepared, Study, compare, foreseen, prepare
 from cuspid.studies.scanners.text import ANCHORS, checklist, methods
 from cuspid.studies.scanners.views import write_views
-from cuspid.trueness import METRICS
 
 _MOST_LINES = 40
 _NEEDED = {"statsmodels": "statistics", "openpyxl": "XLSX tables"}

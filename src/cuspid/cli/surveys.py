@@ -31,12 +31,12 @@ from cuspid.anatomy.numbering import Numbering
 from cuspid.anatomy.shape.mean import MeanShapeOptions, mean_shape
 from cuspid.cli.report import report
 from cuspid.cli.shared import Flat, console, show_progress
-from cuspid.errors import InputError
-from cuspid.jaw import Arch, Jaw
-from cuspid.reporting.figures.drawing import save_picture
-from cuspid.reporting.figures.landmark import save_landmark_picture, save_measure_picture
-from cuspid.reporting.figures.shape import save_modes_picture, save_variance_picture
-from cuspid.shape_model import ShapeModel
+from cuspid.model.jaw import Arch, Jaw
+from cuspid.model.shape_model import ShapeModel
+from cuspid.report.figures.drawing import save_picture
+from cuspid.report.figures.landmark import save_landmark_picture, save_measure_picture
+from cuspid.report.figures.shape import save_modes_picture, save_variance_picture
+from cuspid.runtime.errors import InputError
 
 
 def measure(

@@ -10,9 +10,9 @@ from tyro.conf import Positional
 
 from cuspid import storage
 from cuspid.cli.shared import console
-from cuspid.options import Range
-from cuspid.reporting.live_view import serve
-from cuspid.reporting.same_origin import address
+from cuspid.report.live_view import serve
+from cuspid.report.same_origin import address
+from cuspid.runtime.options import Range
 
 
 def view(

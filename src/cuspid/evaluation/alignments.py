@@ -13,11 +13,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3, best_similarity
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 
 AlignmentKind = Literal["best-fit", "area", "crowns", "landmarks", "spheres", "bodies", "none"]
 """By what a scan is laid on its reference."""

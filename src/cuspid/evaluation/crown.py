@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.geometry import read_only
-from cuspid.jaw import GUM
-from cuspid.mesh import Mesh
-from cuspid.trueness import CrownCompleteness
-from cuspid.visibility import LEAST_OPENNESS, OPENNESS_REACH_MM, openness
+from cuspid.model.jaw import GUM
+from cuspid.model.mesh import Mesh
+from cuspid.model.trueness import CrownCompleteness
+from cuspid.model.visibility import LEAST_OPENNESS, OPENNESS_REACH_MM, openness
 
 WITHIN_UM = (50, 100, 200)
 """Distances at which completeness is evaluated."""

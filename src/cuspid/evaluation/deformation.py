@@ -27,10 +27,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from cuspid.arch_curve import ArchCurve
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import Places
 from cuspid.evaluation.registration import biweights
+from cuspid.model.arch_curve import ArchCurve
 
 MODES = ("scale", "spread", "lift", "twist")
 """In the order of tables. Scale is in ppm, the others in um at the ends."""

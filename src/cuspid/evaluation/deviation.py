@@ -27,17 +27,17 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.errors import InputError
 from cuspid.evaluation.crown import OpenCrown, crown_completeness, within_pct
 from cuspid.evaluation.distance import ClosestPoints, SignedDistance
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, register
 from cuspid.evaluation.teeth import CANINES, LEAST_SAMPLES, MOLARS, distance_error_um, drift_um, find_teeth
 from cuspid.geometry import Rigid3
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import SHARE, Options, Range
-from cuspid.trueness import DeviationStatistics, Trueness
-from cuspid.visibility import openness
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.trueness import DeviationStatistics, Trueness
+from cuspid.model.visibility import openness
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SHARE, Options, Range
 
 _LEAST_TOOTH_PCT = 30.0
 """Share of a tooth's surface that must lie within 200 um of the scan for its position to be evaluated."""

@@ -13,8 +13,8 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.mesh import Mesh
-from cuspid.workers import computed_once
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.workers import computed_once
 
 _ON_EDGE = 1e-7
 """Barycentric weight below which a point of a face is considered to lie on the opposite edge."""

@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, axes_about, lengths_along
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
-from cuspid.trueness import CutMargin, MarginSection
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.trueness import CutMargin, MarginSection
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 _FINE_MM = 0.01
 """Spacing of the points of a section."""

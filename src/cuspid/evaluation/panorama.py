@@ -5,7 +5,7 @@ frame truly was, meets the true jaw in a point, and the panorama places that poi
 best similarity (least squares, Umeyama 1991) of all tooth pixels is removed; what remains is the geometric error.
 It is told once more along the direction in which the panorama looks at the jaw, which may be another than that of the
 jaw's occlusal frame. The same similarity lays the panorama over the reference render of the true jaw
-(:class:`cuspid.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is
+(:class:`cuspid.model.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is
 aligned with it by image features, and only the pictures are compared.
 
 Pictures are compared in grey (Rec. 601), where the panorama shows nothing as black: ZNCC over the pixels of the teeth,
@@ -26,13 +26,13 @@ from jaxtyping import Bool, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt
 from skimage.metrics import structural_similarity
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, best_similarity
-from cuspid.options import Options, Range
-from cuspid.panorama import Panorama
-from cuspid.trueness import NOTHING, GroundTruth, ReferenceRender
-from cuspid.values import shown
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET
+from cuspid.model.panorama import Panorama
+from cuspid.model.trueness import NOTHING, GroundTruth, ReferenceRender
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.values import shown
 
 FEWEST_TEETH_PX = 200
 """Minimum number of sampled pixels that show teeth, for an alignment by geometry."""

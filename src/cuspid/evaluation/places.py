@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import biweights
 from cuspid.geometry import Rigid3, read_only
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
 
 _ROUNDS, _SETTLED_UM = 30, 1e-3
 """Number of reweightings of a small motion at most, and the change of any deviation that ends them."""

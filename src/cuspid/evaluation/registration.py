@@ -12,12 +12,12 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cuspid.errors import InputError
 from cuspid.evaluation.distance import ClosestPoints, SignedDistance
 from cuspid.evaluation.search import SearchOptions, find_poses
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 _NARROWEST_MM, _WIDEST_MM = 1e-3, 2.0
 """Bounds of the distance at which a sample loses its weight."""

@@ -22,14 +22,14 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.errors import InputError
 from cuspid.evaluation.deviation import statistics
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
-from cuspid.trueness import DeviationStatistics
+from cuspid.model.mesh import Mesh
+from cuspid.model.trueness import DeviationStatistics
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 LIMIT_FACTOR = 2.8
 """Repeatability limit over repeatability standard deviation: 1.96 sqrt(2), rounded as in ISO 5725-6."""

@@ -13,12 +13,12 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3, axes_about
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 _TURNS, _TILT_DEG = 12, 15.0
 """Starts about the axis, and how far some of them are tilted to either side."""

@@ -20,10 +20,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cuspid.geometry import Rigid3, axes_about, unit
-from cuspid.kernels import kernel
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
-from cuspid.workers import map_in_threads
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.kernels import kernel
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.workers import map_in_threads
 
 _MAX_VOXELS = 1e6
 _TESTED = 144

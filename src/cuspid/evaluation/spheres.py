@@ -26,11 +26,11 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 from scipy.spatial import KDTree
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
-from cuspid.jaw import Jaw, Sphere
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
+from cuspid.model.jaw import Jaw, Sphere
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 _ROUNDS = 30
 """Number of selections of points after which a sphere that has not settled is given up."""

@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
+from cuspid.runtime.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.capture import Dropped, Frame, ImageFolder
-from cuspid.errors import InputError
-from cuspid.image_files import read_image
-from cuspid.rig import Handpiece
+from cuspid.model.capture import Dropped, Frame, ImageFolder
+from cuspid.model.rig import Handpiece
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import read_image
 from cuspid.storage.captures import IMAGE_SUFFIXES, folders_of_images
 from cuspid.storage.files import finished
 

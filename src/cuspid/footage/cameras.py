@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from cuspid.errors import OutputError
-from cuspid.options import Options, Range
+from cuspid.runtime.errors import OutputError
+from cuspid.runtime.options import Options, Range
 
 Pixels = UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]
 """Grey or RGB."""

@@ -19,11 +19,11 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 
-from cuspid.errors import InputError
 from cuspid.footage.cameras import ExposureOptions, Pixels, Ready, Setting, Shot
 from cuspid.footage.jpeg import whole_jpeg
 from cuspid.footage.quality import look, seen
-from cuspid.options import Options, Range
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 Device = Any
 """``cv2.VideoCapture``, or what behaves like it."""

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from cuspid.errors import InputError
-from cuspid.image_files import image_size, read_deep
-from cuspid.options import Options, Range
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import image_size, read_deep
+from cuspid.runtime.options import Options, Range
 from cuspid.storage.sequences import hash_source, images_in
 from cuspid.storage.videos import VideoFrame, VideoLength, read_video, video_length
 

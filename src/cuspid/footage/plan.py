@@ -12,8 +12,6 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.capture import Dropped, Frame
-from cuspid.errors import InputError
 from cuspid.footage.films import Film
 from cuspid.footage.quality import Looks, QualityOptions, faults
 from cuspid.footage.synchronise import (
@@ -31,8 +29,10 @@ from cuspid.footage.synchronise import (
     one_by_one,
     one_clock,
 )
-from cuspid.options import Options, Range
-from cuspid.rig import Handpiece
+from cuspid.model.capture import Dropped, Frame
+from cuspid.model.rig import Handpiece
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 FrameTimes = Mapping[str, Mapping[str, float]]
 """For each camera, the times in s of its frames, by number or name."""

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from cuspid.errors import InputError
 from cuspid.footage.cameras import ExposureOptions, Pixels, Ready, Shot
 from cuspid.footage.films import DevelopmentOptions, frames_of, open_film, sizes_of
 from cuspid.footage.jpeg import whole_jpeg
-from cuspid.inputs import read_bytes
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import read_bytes
 from cuspid.storage.videos import read_jpegs, video_rate
 
 USUAL_PER_S = 30.0

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 from scipy.ndimage import median_filter
 
-from cuspid.options import SHARE, Options, Range
+from cuspid.runtime.options import SHARE, Options, Range
 
 _LOOKED_AT_PX = 640
 """Longer side of the reduced image that is judged; it has less noise, and still shows any blur that matters."""

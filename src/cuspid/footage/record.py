@@ -19,10 +19,10 @@ from queue import Empty, Queue
 from threading import Event, Lock, Thread
 from typing import Annotated
 
-from cuspid.errors import CuspidError, InputError, OutputError
 from cuspid.footage.cameras import Cameras, ExposureOptions, Ready, Shot
 from cuspid.footage.slots import Slots
-from cuspid.options import Options, Range
+from cuspid.runtime.errors import CuspidError, InputError, OutputError
+from cuspid.runtime.options import Options, Range
 from cuspid.storage.captures import IMAGE_SUFFIXES
 from cuspid.storage.files import AppendedTable, finished, write_bytes
 

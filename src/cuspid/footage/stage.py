@@ -12,18 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from cuspid.capture import Capture, ImageFolder
-from cuspid.errors import InputError
 from cuspid.footage.films import DevelopmentOptions, Film, FilmFrame, developed, frames_of, open_film, sizes_of
 from cuspid.footage.plan import Bad, Films, Plan
 from cuspid.footage.quality import Looks, look, seen
-from cuspid.inputs import read_bytes
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece
+from cuspid.model.capture import Capture, ImageFolder
+from cuspid.model.rig import Handpiece
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import read_bytes
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import map_in_threads
 from cuspid.storage.captures import write_capture, write_image
 from cuspid.storage.files import read_arrays, write_arrays, write_bytes
 from cuspid.storage.stages import Stage
-from cuspid.workers import map_in_threads
 
 _CODE = (__name__,)
 

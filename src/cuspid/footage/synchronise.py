@@ -16,8 +16,8 @@ from jaxtyping import Float
 from scipy.ndimage import median_filter
 from scipy.signal import correlate
 
-from cuspid.errors import InputError
-from cuspid.options import SHARE, Options, Range
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SHARE, Options, Range
 from cuspid.storage.sequences import name_order
 
 Sync = Literal["names", "times", "flash", "motion", "none"]

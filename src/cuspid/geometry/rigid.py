@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 from scipy.spatial.transform import Rotation
 
-from cuspid.errors import InputError
-from cuspid.values import shown
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import shown
 
 _Array = TypeVar("_Array", bound=np.ndarray)
 _ROUNDING = 1e-6

@@ -39,13 +39,13 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from cuspid.body import CAMERA_MM
-from cuspid.errors import InputError
-from cuspid.handpiece.holder import HolderOptions
+from cuspid.handpiece.cad.holder import HolderOptions
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.presets import PRESETS
-from cuspid.inputs import read_text
-from cuspid.values import one_line, shown, title
+from cuspid.model.body import CAMERA_MM
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import read_text
+from cuspid.runtime.values import one_line, shown, title
 
 _LARGEST = 1e6
 """No figure is larger; NaN is none."""

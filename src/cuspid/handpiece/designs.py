@@ -23,12 +23,12 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.holder import HolderOptions, with_holder
-from cuspid.options import Options, Range
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, depth_of_field_mm
+from cuspid.handpiece.cad.holder import HolderOptions, with_holder
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig, depth_of_field_mm
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 
 @dataclass(frozen=True, kw_only=True)

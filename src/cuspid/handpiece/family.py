@@ -17,7 +17,7 @@ from jaxtyping import Float
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import looking_at
 from cuspid.handpiece.optics import Optics
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
 
 @dataclass(frozen=True, kw_only=True)

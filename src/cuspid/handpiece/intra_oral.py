@@ -12,11 +12,11 @@ from typing import Annotated
 
 import numpy as np
 
-from cuspid.camera import Camera
+from cuspid.handpiece.cad.holder import HolderOptions, with_holder
 from cuspid.handpiece.designs import looking_at
-from cuspid.handpiece.holder import HolderOptions, with_holder
-from cuspid.options import Options, Range
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.runtime.options import Options, Range
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
-from cuspid.rig import Handpiece
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece
+from cuspid.runtime.errors import InputError
 
 GREEN_UM = 0.55
 """Wavelength for which diffraction is given."""

@@ -2,8 +2,8 @@
 
 A *section* is the neighbourhood of a tooth in the frame of its mesh (+Z out of the gum) with the positions that the
 handpiece takes there. A face counts as seen if, at one position at least, both cameras of a stereo pair see it
-(:func:`cuspid.pairing.stereo_pairs`: the pairs that depth is measured from). Its *bound* is the Cramer-Rao bound at the
-best position and for the best camera r, matched with its partners p:
+(:func:`cuspid.model.pairing.stereo_pairs`: the pairs that depth is measured from). Its *bound* is the Cramer-Rao bound
+at the best position and for the best camera r, matched with its partners p:
 
     I = J_r^T J_r / sigma^2 + sum_p J_p^T J_p / sigma_rp^2
 
@@ -23,21 +23,21 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.brief import DesignBrief
+from cuspid.handpiece.cad.holder import with_holder
 from cuspid.handpiece.family import BOUNDS, LAYOUTS, Layout, Shape, build_handpiece
-from cuspid.handpiece.holder import with_holder
 from cuspid.handpiece.optics import Optics
 from cuspid.handpiece.precision import NoiseModel, bound_rms_um, noise_px, projection_jacobian
-from cuspid.mesh import Mesh
-from cuspid.options import SEED, Options, Range
-from cuspid.pairing import PairingOptions, stereo_pairs
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece, MountedCamera
-from cuspid.room import FAR_MM, Room
-from cuspid.values import shown
-from cuspid.visibility import VisibilityOptions, visible_faces
+from cuspid.model.mesh import Mesh
+from cuspid.model.pairing import PairingOptions, stereo_pairs
+from cuspid.model.rig import Handpiece, MountedCamera
+from cuspid.model.room import FAR_MM, Room
+from cuspid.model.visibility import VisibilityOptions, visible_faces
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SEED, Options, Range
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.values import shown
 
 _REACH_MM = 11.0
 """Of the mesh around the middle of a tooth, so much is kept on all sides."""

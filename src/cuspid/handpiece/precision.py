@@ -22,14 +22,14 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
 from cuspid.handpiece.optics import Optics
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
-from cuspid.rig import Handpiece, MountedCamera
-from cuspid.visibility import VisibilityOptions, survey_visibility
+from cuspid.model.camera import Camera
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, MountedCamera
+from cuspid.model.visibility import VisibilityOptions, survey_visibility
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,9 @@
 """Where the handpiece was: features, lean pairs, odometry, one bundle adjustment. The only import of pycolmap."""
 
-from cuspid.signals import handlers_kept
+from cuspid.runtime.signals import handlers_kept
 
 with handlers_kept():  # pycolmap's prints the stack of its own code at SIGTERM
-    from cuspid.motion.adjustment import AdjustmentOptions, adjust
+    from cuspid.motion.bundle.adjustment import AdjustmentOptions, adjust
     from cuspid.motion.location import MotionOptions, locate
 
 __all__ = ["AdjustmentOptions", "MotionOptions", "adjust", "locate"]

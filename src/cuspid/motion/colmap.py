@@ -1,8 +1,8 @@
 """COLMAP's types, its sparse models on disk, and its own mapper for comparison.
 
-COLMAP's rig frame is that of the rig's reference camera, here always the first one; see :meth:`cuspid.rig.Rig.rebased`.
-Images are named ``<camera>/<frame><suffix>``. COLMAP's mapper runs in several threads and is not
-repeatable bit for bit.
+COLMAP's rig frame is that of the rig's reference camera, here always the first one; see
+:meth:`cuspid.model.rig.Rig.rebased`. Images are named ``<camera>/<frame><suffix>``. COLMAP's mapper runs in several
+threads and is not repeatable bit for bit.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ import pycolmap
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from cuspid.camera import Camera
-from cuspid.capture import Capture, Dropped, Frame, ImageFolder, image_name
-from cuspid.errors import InputError, OutputError, ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.inputs import read_bytes
-from cuspid.motion.adjustment import residuals_px
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import Rig
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Capture, Dropped, Frame, ImageFolder, image_name
+from cuspid.model.reconstruction import Reconstruction, Tracks
+from cuspid.model.rig import Rig
+from cuspid.motion.bundle.adjustment import residuals_px
+from cuspid.runtime.errors import InputError, OutputError, ReconstructionError
+from cuspid.runtime.inputs import read_bytes
 from cuspid.storage.files import digest_of, hash_file, whole_files
 
 MODEL_FILES = ("cameras", "images", "points3D")

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.capture import Capture
-from cuspid.epipolar import epipolar_residuals, skew
 from cuspid.geometry import Rigid3
-from cuspid.motion.features import detect_all
+from cuspid.model.capture import Capture
+from cuspid.model.epipolar import epipolar_residuals, skew
+from cuspid.model.pairing import stereo_pairs
+from cuspid.motion.frontend.features import detect_all
+from cuspid.motion.frontend.odometry import searched_mm
+from cuspid.motion.frontend.pairs import IndexedFeatures, match_guided
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.location import MotionOptions, indexed
-from cuspid.motion.odometry import searched_mm
-from cuspid.motion.pairs import IndexedFeatures, match_guided
-from cuspid.motion.pictures import Pictures
-from cuspid.pairing import stereo_pairs
-from cuspid.progress import Progress, silent
+from cuspid.runtime.progress import Progress, silent
 
 _REACH_PX, _LEAST_MATCHES = 8.0, 10
 """Matches are sought within this distance of their epipolar lines, and a pair tells something from so many on."""

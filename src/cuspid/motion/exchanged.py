@@ -19,18 +19,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.capture import Capture
-from cuspid.epipolar import epipolar_residuals, skew
-from cuspid.errors import InputError
-from cuspid.motion.features import Features, detect_all
+from cuspid.model.capture import Capture
+from cuspid.model.epipolar import epipolar_residuals, skew
+from cuspid.model.pairing import camera_groups, stereo_pairs
+from cuspid.model.rig import Handpiece
+from cuspid.motion.frontend.features import Features, detect_all
+from cuspid.motion.frontend.odometry import Edge, relative_pose, triangulate_frame
+from cuspid.motion.frontend.pairs import match_unguided
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.location import MotionOptions, indexed
-from cuspid.motion.odometry import Edge, relative_pose, triangulate_frame
-from cuspid.motion.pairs import match_unguided
-from cuspid.motion.pictures import Pictures
-from cuspid.pairing import camera_groups, stereo_pairs
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece
-from cuspid.workers import computed_once, map_in_threads
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import computed_once, map_in_threads
 
 _FRAMES, _KEYPOINTS = 3, 500
 """Frames that are looked at, and keypoints of each image."""

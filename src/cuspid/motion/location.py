@@ -12,14 +12,17 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from cuspid.capture import Capture
-from cuspid.errors import ReconstructionError
 from cuspid.geometry import Rigid3
-from cuspid.motion.adjustment import AdjustmentOptions, adjust, calibration_sigma_px
-from cuspid.motion.closure import Image, closing_pairs
-from cuspid.motion.features import FeatureOptions, Features, detect_all
-from cuspid.motion.least_squares_matching import LeastSquaresOptions, ReadGray, match_patches
-from cuspid.motion.odometry import (
+from cuspid.model.capture import Capture
+from cuspid.model.pairing import PairingOptions, require_stereo, resolved_mm, stereo_pairs
+from cuspid.model.reconstruction import Reconstruction, Tracks
+from cuspid.model.rig import Handpiece, Rig
+from cuspid.model.unrolling import is_rolling, unrollings
+from cuspid.motion.bundle.adjustment import AdjustmentOptions, adjust, calibration_sigma_px
+from cuspid.motion.frontend.closure import Image, closing_pairs
+from cuspid.motion.frontend.features import FeatureOptions, Features, detect_all
+from cuspid.motion.frontend.least_squares_matching import LeastSquaresOptions, ReadGray, match_patches
+from cuspid.motion.frontend.odometry import (
     Cloud,
     FrameFeatures,
     OdometryOptions,
@@ -29,16 +32,13 @@ from cuspid.motion.odometry import (
     rays_in_rig,
     triangulate_frame,
 )
-from cuspid.motion.pairs import IndexedFeatures, MatchingOptions, frame_pairs, index_features, match_guided
-from cuspid.motion.pictures import Pictures
-from cuspid.motion.tracks import intersect_rays, join, points_across, thin
-from cuspid.options import SEED, SHARE, Options, Range
-from cuspid.pairing import PairingOptions, require_stereo, resolved_mm, stereo_pairs
-from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction, Tracks
-from cuspid.rig import Handpiece, Rig
-from cuspid.unrolling import is_rolling, unrollings
-from cuspid.workers import computed_once, map_in_threads
+from cuspid.motion.frontend.pairs import IndexedFeatures, MatchingOptions, frame_pairs, index_features, match_guided
+from cuspid.motion.frontend.pictures import Pictures
+from cuspid.motion.frontend.tracks import intersect_rays, join, points_across, thin
+from cuspid.runtime.errors import ReconstructionError
+from cuspid.runtime.options import SEED, SHARE, Options, Range
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import computed_once, map_in_threads
 
 _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 """Standard deviations of the scale and, apart from it, of the length of a scan, above which advice is given."""

@@ -13,21 +13,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.capture import Capture, ImageSource
-from cuspid.errors import ReconstructionError
-from cuspid.mesh import Mesh
-from cuspid.motion.adjustment import adjust
+from cuspid.model.capture import Capture, ImageSource
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import Reconstruction, chosen_tracks
+from cuspid.model.sparse_model import SparseModel
+from cuspid.motion.bundle.adjustment import adjust
+from cuspid.motion.frontend.patches import PatchOptions, follow_rig_points, hold_together
 from cuspid.motion.location import MotionOptions, locate, with_advice
-from cuspid.motion.patches import PatchOptions, follow_rig_points, hold_together
-from cuspid.motion.single import ENAMEL, SingleOptions, normalise_contrast
-from cuspid.progress import Progress, silent
-from cuspid.reconstruction import Reconstruction, chosen_tracks
-from cuspid.sparse_model import SparseModel
+from cuspid.motion.monocular.single import ENAMEL, SingleOptions, normalise_contrast
+from cuspid.runtime.errors import ReconstructionError
+from cuspid.runtime.progress import Progress, silent
 
 
 @dataclass(frozen=True, eq=False)
 class _EvenContrast:
-    """The images of another source with even local contrast. An :class:`cuspid.capture.ImageSource`."""
+    """The images of another source with even local contrast. An :class:`cuspid.model.capture.ImageSource`."""
 
     source: ImageSource
     options: SingleOptions

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-from cuspid.capture import Capture
+from cuspid.model.capture import Capture
+from cuspid.model.reconstruction import DepthMap, Reconstruction
 from cuspid.motion.colmap import hash_model, locate_with_colmap, read_model, write_model
+from cuspid.motion.icp.surface_tracking import SurfaceTrackingOptions, track_surfaces
 from cuspid.motion.location import MotionOptions
 from cuspid.motion.location import locate as locate_with_rig
-from cuspid.motion.surface_tracking import SurfaceTrackingOptions, track_surfaces
-from cuspid.progress import Progress, silent
-from cuspid.reconstruction import DepthMap, Reconstruction
+from cuspid.runtime.progress import Progress, silent
 from cuspid.storage.captures import hash_capture
 from cuspid.storage.reconstructions import RECONSTRUCTION_FILES, read_reconstruction, write_reconstruction
 from cuspid.storage.stages import Stage

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.geometry import Rigid3
-from cuspid.motion.features import Features
+from cuspid.model.pairing import stereo_pairs
+from cuspid.model.rig import Handpiece
+from cuspid.motion.frontend.features import Features
+from cuspid.motion.frontend.odometry import Cloud, Edge, FrameFeatures, relative_pose, triangulate_frame
+from cuspid.motion.frontend.revisits import WORDS, look, typical
 from cuspid.motion.location import MotionOptions, indexed, loosened
-from cuspid.motion.odometry import Cloud, Edge, FrameFeatures, relative_pose, triangulate_frame
-from cuspid.motion.revisits import WORDS, look, typical
-from cuspid.pairing import stereo_pairs
-from cuspid.rig import Handpiece
 
 Recall = Callable[[str], Mapping[tuple[str, str], Features]]
 """The keypoints of an earlier frame, by frame and camera."""

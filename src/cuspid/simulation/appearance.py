@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from cuspid.jaw import GUM, Jaw
-from cuspid.kernels import kernel
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.runtime.kernels import kernel
 
 Colour = tuple[float, float, float]
 Preset = Literal["artificial", "powder", "enamel", "natural"]

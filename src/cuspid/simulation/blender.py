@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from cuspid.capture import Frame
-from cuspid.errors import InputError, MissingDependencyError
 from cuspid.geometry import Rigid3, axes_about
-from cuspid.rig import Handpiece, Light, MountedCamera
+from cuspid.model.capture import Frame
+from cuspid.model.rig import Handpiece, Light, MountedCamera
+from cuspid.runtime.errors import InputError, MissingDependencyError
 from cuspid.simulation.appearance import Appearance, face_materials
 from cuspid.simulation.optics import IDEAL, Optics
 from cuspid.simulation.raycast import Scene, Sink, image_rng, metered_gains

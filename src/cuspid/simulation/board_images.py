@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from cuspid.board import Board
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.options import SEED, Options, Range
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece, Light
+from cuspid.model.board import Board
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, Light
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SEED, Options, Range
+from cuspid.runtime.progress import Progress, silent
 from cuspid.simulation.raycast import pixel_rays
 from cuspid.simulation.sensor import record
 from cuspid.storage.captures import write_image

@@ -9,10 +9,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cuspid.capture import Capture
-from cuspid.jaw import Jaw
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece
+from cuspid.model.capture import Capture
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece
+from cuspid.model.trueness import GroundTruth
+from cuspid.runtime.progress import Progress, silent
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.lights import lit
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
@@ -20,7 +21,6 @@ from cuspid.simulation.reference_render import ReferenceRenderOptions, render_re
 from cuspid.simulation.stage import RenderOptions, jaw_files, look_of, scene_of, take_images
 from cuspid.storage.reference_renders import REFERENCE_RENDER_FILES, write_reference_render
 from cuspid.storage.stages import Stage
-from cuspid.trueness import GroundTruth
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,8 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.kernels import kernel
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.kernels import kernel
 
 
 class ShadedMesh(NamedTuple):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera
 
 _BESIDE = 0.1
 """Distance of a light from its camera, as a share of the working distance."""

@@ -11,9 +11,9 @@ from typing import Annotated
 import numpy as np
 
 from cuspid.geometry import Rigid3
-from cuspid.options import SEED, Options, Range
-from cuspid.rig import Handpiece, Light, MountedCamera, Sensor
-from cuspid.tolerances import Tolerances, with_cameras
+from cuspid.model.rig import Handpiece, Light, MountedCamera, Sensor
+from cuspid.model.tolerances import Tolerances, with_cameras
+from cuspid.runtime.options import SEED, Options, Range
 
 _DARKEST = 0.95
 """Maximum loss of light in a corner."""

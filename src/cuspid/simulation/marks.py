@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial import cKDTree
 
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
 from cuspid.simulation.scattering import diffused
 
 _BROAD_MM, _FINE_MM = 2.0, 0.3

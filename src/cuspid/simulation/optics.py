@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
-from cuspid.kernels import kernel
-from cuspid.options import SHARE, Options, Range
-from cuspid.rig import Handpiece, Rig
-from cuspid.shutter import Shutter
+from cuspid.model.camera import Camera
+from cuspid.model.rig import Handpiece, Rig
+from cuspid.model.shutter import Shutter
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.kernels import kernel
+from cuspid.runtime.options import SHARE, Options, Range
 
 _WAVELENGTH_MM = 0.00055
 """Of green light."""
@@ -23,7 +23,7 @@ _AIRY = 0.42
 aperture's inverse."""
 _NEAREST_FOCUS = 0.78
 """Focus, as a share of the working distance: where the disc is as wide at both ends of the depth of field
-(:func:`cuspid.rig.depth_of_field_mm`)."""
+(:func:`cuspid.model.rig.depth_of_field_mm`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,17 +23,18 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from cuspid import workers
-from cuspid.camera import Camera
-from cuspid.capture import Frame
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3, read_only
-from cuspid.gloss import coat, leaving
-from cuspid.jaw import Jaw
-from cuspid.kernels import kernel
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece, MountedCamera
-from cuspid.shutter import Shutter, screw_of
+from cuspid.geometry.gloss import coat, leaving
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Frame
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, MountedCamera
+from cuspid.model.shutter import Shutter, screw_of
+from cuspid.runtime import workers
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.kernels import kernel
+from cuspid.runtime.workers import computed_once, packed
 from cuspid.simulation.appearance import (
     NO_MATERIAL,
     Appearance,
@@ -50,7 +51,6 @@ from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_len
 from cuspid.simulation.scattering import Scattering
 from cuspid.simulation.sensor import record
 from cuspid.simulation.shadows import NOTICEABLE, STEP, Lamps, darken, illuminated, incoming, lamps, segments
-from cuspid.workers import computed_once, packed
 
 _FILM_REFLECTANCE, _FILM_ROUGHNESS = 0.02, 0.03
 """Of a film of saliva (water): Fresnel reflectance at normal incidence, GGX roughness."""

@@ -1,7 +1,7 @@
 """A reference render: a single image of a jaw from above, the ground truth for a panorama (thesis 4.3).
 
 The camera looks straight down on the occlusal plane, orthographic or from a height, with its light beside it, as the
-thesis assumes for the frames. Pixels: see :class:`cuspid.trueness.ReferenceRender`.
+thesis assumes for the frames. Pixels: see :class:`cuspid.model.trueness.ReferenceRender`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float, Int16
 
-from cuspid.errors import InputError
-from cuspid.mesh import RayHits
-from cuspid.options import Options, Range
+from cuspid.model.mesh import RayHits
+from cuspid.model.trueness import NOTHING, ReferenceRender
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 from cuspid.simulation.raycast import BRIGHT_LEVEL, BRIGHT_PERCENTILE, Scene, radiance_along
 from cuspid.simulation.sensor import expose
 from cuspid.simulation.shadows import Lamps
-from cuspid.trueness import NOTHING, ReferenceRender
 
 FAR_LIGHT_MM = 1000.0
 """Height of the light for an orthographic view, from which its direction is within 2 deg of straight down over the

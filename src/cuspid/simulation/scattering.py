@@ -20,7 +20,7 @@ from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
 
 _STEPS, _TOLERANCE = 500, 1e-5
 _FLATTEST = 1e3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from cuspid.rig import Handpiece, Sensor
+from cuspid.model.rig import Handpiece, Sensor
 
 
 def expose(

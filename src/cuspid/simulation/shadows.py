@@ -12,11 +12,11 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.kernels import kernel
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.kernels import kernel
 from cuspid.simulation.hits import Rays, ShadedMesh, dot, normal_of, point_of
 
 AMBIENT = 0.08

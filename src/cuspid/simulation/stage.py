@@ -12,12 +12,15 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.capture import Capture, ImageFolder
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.options import SEED, Options, Range
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece
+from cuspid.model.capture import Capture, ImageFolder
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece
+from cuspid.model.tolerances import EXACT
+from cuspid.model.trueness import GroundTruth
+from cuspid.runtime.options import SEED, Options, Range
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import usable_cores
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import check_blender, render_with_blender
 from cuspid.simulation.lights import lit
@@ -30,9 +33,6 @@ from cuspid.storage.files import digest_of, hash_file
 from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.stages import Stage
 from cuspid.storage.truths import write_path, write_truth
-from cuspid.tolerances import EXACT
-from cuspid.trueness import GroundTruth
-from cuspid.workers import usable_cores
 
 _LOG = logging.getLogger("cuspid")
 

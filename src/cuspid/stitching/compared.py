@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.camera import Camera
-from cuspid.capture import Frame
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import Reconstruction
-from cuspid.rig import Handpiece, Sensor
-from cuspid.sparse_model import SparseModel
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Frame
+from cuspid.model.reconstruction import Reconstruction
+from cuspid.model.rig import Handpiece, Sensor
+from cuspid.model.sparse_model import SparseModel
 
 _REACH = 14
 """How many frames later a partner may be."""

@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.options import Options, Range
+from cuspid.runtime.options import Options, Range
 
 _ROUNDS = 12
 _STRIDE = 3

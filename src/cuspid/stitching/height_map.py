@@ -1,8 +1,8 @@
 """The occlusal frame and a coarse surface, from what the motion of one camera gives: poses and sparse points.
 
 Frames: the *model* is the frame of the motion, in its own units; the *world* is the occlusal frame of
-:mod:`cuspid.panorama`, with z = 0 at the tips of the cusps. Where nothing tells the scale, lengths of the world are
-such that the camera was `NOMINAL_MM` from the teeth, and are not called millimetres.
+:mod:`cuspid.model.panorama`, with z = 0 at the tips of the cusps. Where nothing tells the scale, lengths of the world
+are such that the camera was `NOMINAL_MM` from the teeth, and are not called millimetres.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from scipy.spatial import KDTree
 from skimage.morphology import remove_small_holes
 
 from cuspid.geometry import Rigid3
-from cuspid.kernels import kernel
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
-from cuspid.sparse_model import SparseModel
+from cuspid.model.mesh import Mesh
+from cuspid.model.sparse_model import SparseModel
+from cuspid.runtime.kernels import kernel
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.workers import computed_once
 from cuspid.stitching.trajectory import frames_there
-from cuspid.workers import computed_once
 
 NOMINAL_MM = 14.0
 """Distance from an intra-oral camera to the teeth, where nothing else is known."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.geometry import Rigid3
-from cuspid.occlusal_plane import levelled
+from cuspid.model.occlusal_plane import levelled
 from cuspid.stitching.height_map import AXES_SD_DEG, HeightMap
 
 _STEPS = 8
@@ -17,7 +17,7 @@ the surface's slope and the tangent of the tilt."""
 def level_by_crowns(surface: HeightMap) -> Rigid3:
     """The turn about the origin after which the crowns lie level.
 
-    The rule is that of :mod:`cuspid.occlusal_plane`, by which a mesh gets its occlusal frame, too.
+    The rule is that of :mod:`cuspid.model.occlusal_plane`, by which a mesh gets its occlusal frame, too.
     """
 
     def seen(turn: Rigid3) -> Float[np.ndarray, "r c 3"]:

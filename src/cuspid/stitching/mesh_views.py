@@ -2,8 +2,9 @@
 tongue.
 
 All views are orthographic, so that lengths in them are those of the mesh. Frames: the world is the occlusal frame of
-:mod:`cuspid.panorama`. A side strip looks across the arch curve, and a pixel shows what lies on its side of the curve:
-the arch bends, so that lengths along it are those of the curve, and lengths across it, which are heights, are true.
+:mod:`cuspid.model.panorama`. A side strip looks across the arch curve, and a pixel shows what lies on its side of the
+curve: the arch bends, so that lengths along it are those of the curve, and lengths across it, which are heights, are
+true.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from cuspid.errors import InputError
 from cuspid.geometry import lengths_along, unit
-from cuspid.mesh import Mesh, RayHits
-from cuspid.options import Options, Range
-from cuspid.panorama import ZONES, Panorama, Strip
-from cuspid.progress import Progress, silent
+from cuspid.model.mesh import Mesh, RayHits
+from cuspid.model.panorama import ZONES, Panorama, Strip
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.progress import Progress, silent
 from cuspid.stitching.strip import StripOptions, sides_of, zones_of
 
 _MOST_PX = 30_000_000

@@ -1,7 +1,7 @@
 """Frames of one camera, rectified on the surface, to one occlusal view: an orthophoto.
 
-Frames: the world is the occlusal frame of :mod:`cuspid.panorama`. The *canvas* is the panorama's pixel grid. A frame is
-only ever held alone; what grows is the canvas.
+Frames: the world is the occlusal frame of :mod:`cuspid.model.panorama`. The *canvas* is the panorama's pixel grid. A
+frame is only ever held alone; what grows is the canvas.
 
 First every frame is looked at on a grid of coarse cells, each `CELL_PX` wide: for every cell the best few frames are
 kept, those that look straight down on it, see it away from their border and not burnt out. Then the choice is made
@@ -20,15 +20,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, Shaped, UInt8
 from skimage.morphology import remove_small_objects
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.geometry import Rigid3
-from cuspid.options import Options, Range
-from cuspid.progress import Progress, silent
-from cuspid.sparse_model import SparseModel
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.model.sparse_model import SparseModel
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import map_ahead
 from cuspid.stitching.gain_compensation import Compensation, GainOptions, Samples, balance
 from cuspid.stitching.height_map import HeightMap
 from cuspid.stitching.seams import SeamOptions, choose
-from cuspid.workers import map_ahead
 
 CELL_PX = 6
 """Width in px of the cells on which the frame is chosen."""

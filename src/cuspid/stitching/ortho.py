@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from cuspid.geometry import Rigid3, best_similarity
-from cuspid.panorama import FrameUse, Panorama, Strip
-from cuspid.progress import Progress, silent
-from cuspid.sparse_model import SparseModel
+from cuspid.model.panorama import FrameUse, Panorama, Strip
+from cuspid.model.sparse_model import SparseModel
+from cuspid.runtime.progress import Progress, silent
 from cuspid.stitching.compared import Compared, frames_beside
 from cuspid.stitching.height_map import (
     HeightMap,

@@ -9,7 +9,7 @@ instant see the same light and shade: there it is the brightness itself that agr
 follows from semi-global optimisation (Hirschmueller 2008) over the volume of places and heights.
 
 Windows on a plane are wrong where the surface is steep, and its slope tells what light it loses on the way to each
-camera (see :mod:`cuspid.stereo.glare`). Therefore the same is done again, twice, with finer steps, on copies of the
+camera (see :mod:`cuspid.mvs.glare`). Therefore the same is done again, twice, with finer steps, on copies of the
 surface found before that lie a little higher and lower.
 
 The volume grows with the arch; of the frames only some are held.
@@ -28,19 +28,19 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from skimage.morphology import remove_small_holes, remove_small_objects
 from skimage.restoration import inpaint_biharmonic
 
-from cuspid.camera import Camera, undistortion_maps
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.gloss import leaving
-from cuspid.kernels import kernel
-from cuspid.options import Options, Range
-from cuspid.progress import Progress, silent
-from cuspid.semi_global import semi_global
-from cuspid.sparse_model import SparseModel
+from cuspid.geometry.gloss import leaving
+from cuspid.geometry.semi_global import semi_global
+from cuspid.model.camera import Camera, undistortion_maps
+from cuspid.model.sparse_model import SparseModel
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.kernels import kernel
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import map_in_threads
 from cuspid.stitching.compared import Compared, camera_gains
 from cuspid.stitching.height_map import HOLE_MM2, HeightMap
 from cuspid.stitching.mosaic import BURNT, brightest, footprint
-from cuspid.workers import map_in_threads
 
 _BLOCK = 24
 """Images that are paired at a time."""

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.panorama import Panorama
+from cuspid.model.panorama import Panorama
+from cuspid.runtime.errors import InputError
 
 _READING_MM = 0.1
 """An error in reading callipers, to tell what it amounts to."""

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float, Int, Int16
 
-from cuspid.options import Options, Range
+from cuspid.runtime.options import Options, Range
 
 _ROUNDS = 10
 

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET
 from cuspid.geometry import unit
-from cuspid.options import Options, Range
-from cuspid.panorama import ZONES, Panorama, Strip
-from cuspid.sparse_model import SparseModel
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET
+from cuspid.model.panorama import ZONES, Panorama, Strip
+from cuspid.model.sparse_model import SparseModel
+from cuspid.runtime.options import Options, Range
 from cuspid.stitching.height_map import HeightMap
 from cuspid.stitching.trajectory import STEP_MM, even, forward, frames_there, smooth
 

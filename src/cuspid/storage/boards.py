@@ -8,13 +8,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from cuspid.board import Board
-from cuspid.errors import InputError
-from cuspid.inputs import read_text
-from cuspid.options import check
+from cuspid.model.board import Board
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import read_text
+from cuspid.runtime.options import check
+from cuspid.runtime.values import number, shown, whole
 from cuspid.storage.calibrations.documents import parse
 from cuspid.storage.files import reading
-from cuspid.values import number, shown, whole
 
 _MM_PER_M = 1000.0
 _MOST = 100

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from cuspid.capture import Capture, Dropped, Frame, ImageFolder
-from cuspid.errors import InputError, OutputError
-from cuspid.rig import Handpiece, Rig
+from cuspid.model.capture import Capture, Dropped, Frame, ImageFolder
+from cuspid.model.rig import Handpiece, Rig
+from cuspid.runtime.errors import InputError, OutputError
+from cuspid.runtime.workers import map_in_threads
 from cuspid.storage.files import as_declared, digest_of, finished, read_json, reading, write_bytes, write_json
 from cuspid.storage.handpieces import hash_handpiece, read_handpiece, write_handpiece, write_rig_config
-from cuspid.workers import map_in_threads
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 

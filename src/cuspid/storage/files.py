@@ -23,9 +23,9 @@ import numpy as np
 from jaxtyping import jaxtyped
 
 import cuspid
-from cuspid.errors import CuspidError, InputError, OutputError
-from cuspid.inputs import LARGEST_MIB, read_text, require_file
-from cuspid.values import one_line, shown
+from cuspid.runtime.errors import CuspidError, InputError, OutputError
+from cuspid.runtime.inputs import LARGEST_MIB, read_text, require_file
+from cuspid.runtime.values import one_line, shown
 
 _Made = TypeVar("_Made")
 _UNUSABLE = (ValueError, TypeError, AttributeError, IndexError, OverflowError, csv.Error, np.linalg.LinAlgError)

@@ -8,10 +8,10 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from cuspid.errors import InputError
-from cuspid.inputs import read_text
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import read_text
+from cuspid.runtime.values import number, shown
 from cuspid.storage.files import reading
-from cuspid.values import number, shown
 
 TIMES_FILES = ("times.csv", "timestamps.csv")
 """How it is named where nobody says."""

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.body import Body, Box
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import MODELS
-from cuspid.pairing import guess_working_distance_mm
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
-from cuspid.shutter import Shutter
+from cuspid.model.body import Body, Box
+from cuspid.model.camera import Camera
+from cuspid.model.pairing import guess_working_distance_mm
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
+from cuspid.model.shutter import Shutter
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import LONGEST_MM, MOST_PX, checked_name, covariance, number, numbers, shown, title, whole
 from cuspid.storage.files import digest_of, read_json, reading, write_json
-from cuspid.values import LONGEST_MM, MOST_PX, checked_name, covariance, number, numbers, shown, title, whole
 
 _MOST_DISTORTION = 1e3
 _BRIGHTEST, _NARROWEST_LOBE = 1e6, 1e4
@@ -267,7 +267,8 @@ def _mounted_from_json(value: Mapping[str, Any], what: str) -> MountedCamera:
 
 def read_handpiece(path: Path | str, working_distance_mm: float | None = None) -> Handpiece:
     """Read ``handpiece.json``, or COLMAP's ``rig_config.json``, which has no working distance: that is the one given
-    here, or else guessed, and said. Its frame is then on the surface, as :meth:`cuspid.rig.Rig.over_surface` has it.
+    here, or else guessed, and said. Its frame is then on the surface, as :meth:`cuspid.model.rig.Rig.over_surface` has
+    it.
 
     Raises InputError that names a missing or unusable field, where nothing can be guessed, and where a file that has a
     working distance is given another.

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from cuspid.errors import InputError
-from cuspid.inputs import is_there, require_file
-from cuspid.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch, Jaw, Landmark, Sphere
-from cuspid.mesh import Mesh
+from cuspid.model.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch, Jaw, Landmark, Sphere
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import is_there, require_file
+from cuspid.runtime.values import LONGEST_MM, number, numbers, one_line, shown, whole
 from cuspid.storage.files import read_json, reading, write_json
 from cuspid.storage.meshes import MESH_SUFFIXES, MeshFile, read_mesh_file, write_mesh
 from cuspid.storage.units import Unit
-from cuspid.values import LONGEST_MM, number, numbers, one_line, shown, whole
 
 _LARGEST_LABEL = 10_000
 OCCLUSAL = "occlusal"

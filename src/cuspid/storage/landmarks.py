@@ -1,9 +1,9 @@
 """Landmark files: JSON of cuspid, and 3D Slicer markups (``.mrk.json``).
 
-Frames. ``occlusal``: that of `cuspid.jaw`. ``mesh``: the coordinates of the file that the jaw's mesh is in, before it
-is brought into the occlusal frame. Slicer knows patient coordinates, LPS (left, posterior, superior) or RAS (right,
-anterior, superior), and reads a mesh file as LPS unless the file says otherwise: LPS is taken for the numbers in the
-mesh file, and RAS has the signs of x and y turned.
+Frames. ``occlusal``: that of `cuspid.model.jaw`. ``mesh``: the coordinates of the file that the jaw's mesh is in,
+before it is brought into the occlusal frame. Slicer knows patient coordinates, LPS (left, posterior, superior) or RAS
+(right, anterior, superior), and reads a mesh file as LPS unless the file says otherwise: LPS is taken for the numbers
+in the mesh file, and RAS has the signs of x and y turned.
 
 Points are told apart by their label alone; the order of a file means nothing. Labels are checked against the scheme of
 names by `cuspid.anatomy.landmarks.scheme.validate`, which knows it. Markups follow Slicer's schema,
@@ -22,10 +22,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
-from cuspid.jaw import Landmark
+from cuspid.model.jaw import Landmark
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import shown
 from cuspid.storage.files import read_json, write_json
-from cuspid.values import shown
 
 LandmarkFrame = Literal["occlusal", "mesh"]
 """What the positions of a landmark file are relative to."""

@@ -16,13 +16,13 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 
-from cuspid.errors import InputError
 from cuspid.geometry import distinct_rows, owned
-from cuspid.inputs import read_bytes, require_file
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import read_bytes, require_file
+from cuspid.runtime.values import LONGEST_MM, one_line
 from cuspid.storage.files import write_bytes
 from cuspid.storage.units import MM_PER_UNIT, Unit
-from cuspid.values import LONGEST_MM, one_line
 
 _PLACE_AND_COLOR = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
 _COLOR = ("red", "green", "blue")

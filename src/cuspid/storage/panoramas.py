@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.errors import InputError, OutputError
-from cuspid.image_files import read_rgba
-from cuspid.inputs import read_text
-from cuspid.panorama import ZONES, FrameUse, Panorama, Strip
+from cuspid.model.panorama import ZONES, FrameUse, Panorama, Strip
+from cuspid.runtime.errors import InputError, OutputError
+from cuspid.runtime.image_files import read_rgba
+from cuspid.runtime.inputs import read_text
+from cuspid.runtime.values import LONGEST_MM, MOST_PX, number, numbers
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, write_arrays, write_bytes, write_json
 from cuspid.storage.tables import write_table
-from cuspid.values import LONGEST_MM, MOST_PX, number, numbers
 
 _HEADER = ("method", "mm_per_px", "origin_px", "part", "parts", "notes")
 _SOURCE = ("frame_index", "frame_pixel", "height_mm")

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image
 
-from cuspid.camera import Camera
-from cuspid.capture import Dropped
-from cuspid.errors import InputError
-from cuspid.image_files import exif_orientation, image_size
-from cuspid.photographs import UPRIGHT, PhotoCamera, Photograph, Photographs
-from cuspid.progress import Progress, silent
+from cuspid.model.camera import Camera
+from cuspid.model.capture import Dropped
+from cuspid.model.photographs import UPRIGHT, PhotoCamera, Photograph, Photographs
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import exif_orientation, image_size
+from cuspid.runtime.progress import Progress, silent
 from cuspid.storage.captures import IMAGE_SUFFIXES
 from cuspid.storage.files import digest_of, finished
 from cuspid.storage.handpieces import read_handpiece

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cuspid.capture import Dropped
 from cuspid.geometry import Rigid3
-from cuspid.reconstruction import DepthMap, Expectation, Funnel, Reconstruction, Refinement, SurfacePoints, Tracks
-from cuspid.rig import Handpiece
+from cuspid.model.capture import Dropped
+from cuspid.model.reconstruction import DepthMap, Expectation, Funnel, Reconstruction, Refinement, SurfacePoints, Tracks
+from cuspid.model.rig import Handpiece
+from cuspid.runtime.values import checked_name, shown
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
     camera_from_json,
@@ -22,7 +23,6 @@ from cuspid.storage.handpieces import (
     rigid_to_json,
     write_handpiece,
 )
-from cuspid.values import checked_name, shown
 
 
 def write_poses(path: Path, rig_from_world: Mapping[str, Rigid3]) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cuspid.errors import InputError
-from cuspid.image_files import read_image
+from cuspid.model.trueness import ReferenceRender
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import read_image
+from cuspid.runtime.values import LONGEST_MM, MOST_PX, number, numbers
 from cuspid.storage.captures import write_image
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, write_arrays, write_json
-from cuspid.trueness import ReferenceRender
-from cuspid.values import LONGEST_MM, MOST_PX, number, numbers
 
 REFERENCE_RENDER_FILES = ("picture.png", "surface.npz", "view.json")
 """What :func:`write_reference_render` writes."""

@@ -15,17 +15,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.capture import Capture
-from cuspid.errors import InputError
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
-from cuspid.inputs import read_text
-from cuspid.jaw import FDI_FROM_UNIVERSAL, GUM, Arch, Jaw
-from cuspid.mesh import Mesh
-from cuspid.panorama import Panorama
-from cuspid.reconstruction import Reconstruction
-from cuspid.rig import Rig
-from cuspid.shape_model import ShapeModel
+from cuspid.model.capture import Capture
+from cuspid.model.facing import facing_outwards
+from cuspid.model.jaw import FDI_FROM_UNIVERSAL, GUM, Arch, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.panorama import Panorama
+from cuspid.model.reconstruction import Reconstruction
+from cuspid.model.rig import Rig
+from cuspid.model.shape_model import ShapeModel
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import read_text
+from cuspid.runtime.values import LONGEST_MM, numbers
 from cuspid.storage.captures import read_capture
 from cuspid.storage.files import hash_file, read_arrays, read_json, read_manifest, reading
 from cuspid.storage.handpieces import read_handpiece
@@ -35,7 +36,6 @@ from cuspid.storage.panoramas import read_panorama
 from cuspid.storage.reconstructions import read_reconstruction
 from cuspid.storage.shapes import read_shape_model
 from cuspid.storage.units import Unit
-from cuspid.values import LONGEST_MM, numbers
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

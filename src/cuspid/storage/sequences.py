@@ -7,19 +7,19 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-from cuspid.camera import Camera
-from cuspid.capture import ImageFolder
-from cuspid.errors import InputError
-from cuspid.image_files import exif_orientation, image_size, recorded_size
-from cuspid.image_sequence import ImageSequence
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.capture import ImageFolder
+from cuspid.model.image_sequence import ImageSequence
+from cuspid.model.rig import Handpiece, Rig
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import exif_orientation, image_size, recorded_size
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.values import checked_name
 from cuspid.storage.calibrations import MOST_LOST_PX, read_calibration
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
 from cuspid.storage.files import digest_of, finished, hash_file, read_json
 from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.videos import VIDEO_SUFFIXES, read_video, video_length
-from cuspid.values import checked_name
 
 LEAST_PX = 32
 """Side of a frame that shows something."""

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
-from cuspid.mesh import Mesh
-from cuspid.shape_model import MeanStep, ShapeModel
+from cuspid.model.mesh import Mesh
+from cuspid.model.shape_model import MeanStep, ShapeModel
+from cuspid.runtime.errors import InputError
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, write_arrays, write_json
 from cuspid.storage.jaws import read_jaw, write_jaw
 

@@ -19,8 +19,8 @@ from importlib.resources import files as package_files
 from pathlib import Path
 from threading import Lock
 
-from cuspid.errors import InputError, OutputError
-from cuspid.inputs import read_bytes
+from cuspid.runtime.errors import InputError, OutputError
+from cuspid.runtime.inputs import read_bytes
 from cuspid.storage.code_digest import PACKAGE, Code
 from cuspid.storage.files import digest_of, hash_file, open_to_append
 

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cuspid.image_files import read_rgba
-from cuspid.inputs import read_bytes, read_text
+from cuspid.runtime.image_files import read_rgba
+from cuspid.runtime.inputs import read_bytes, read_text
+from cuspid.runtime.values import LONGEST_MM, number
 from cuspid.storage.files import read_json, reading, write_bytes, write_json
 from cuspid.storage.tables import write_table
-from cuspid.values import LONGEST_MM, number
 
 
 class ScaledStrip(NamedTuple):

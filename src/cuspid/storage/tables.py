@@ -7,8 +7,8 @@ import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from cuspid.errors import InputError, MissingDependencyError
-from cuspid.inputs import read_text
+from cuspid.runtime.errors import InputError, MissingDependencyError
+from cuspid.runtime.inputs import read_text
 from cuspid.storage.files import whole_file, write_bytes
 
 _LONGEST_SHEET = 31

@@ -6,8 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from cuspid.model.trueness import STATISTICS, Trueness
 from cuspid.storage.files import write_json
-from cuspid.trueness import STATISTICS, Trueness
 
 
 def trueness_summary(trueness: Trueness) -> dict[str, Any]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from cuspid.jaw import GUM
+from cuspid.model.jaw import GUM
+from cuspid.model.trueness import GroundTruth
 from cuspid.storage.files import write_json
 from cuspid.storage.handpieces import read_handpiece, write_handpiece
 from cuspid.storage.jaws import read_jaw, write_jaw
 from cuspid.storage.reconstructions import read_poses, write_poses
-from cuspid.trueness import GroundTruth
 
 
 def write_truth(folder: Path, truth: GroundTruth) -> None:

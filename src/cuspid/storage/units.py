@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
-from cuspid.mesh import Mesh
-from cuspid.workers import computed_once
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.workers import computed_once
 
 Unit = Literal["mm", "cm", "m", "in", "um"]
 MM_PER_UNIT: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "um": 0.001}

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from cuspid.capture import Capture
-from cuspid.errors import OutputError
-from cuspid.inputs import require_file
+from cuspid.model.capture import Capture
+from cuspid.runtime.errors import OutputError
+from cuspid.runtime.inputs import require_file
 from cuspid.storage.files import whole_file
 
 FRAMES_PER_S = 30.0

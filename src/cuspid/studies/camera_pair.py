@@ -24,8 +24,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cuspid.anatomy.surfaces import named_surfaces, tooth_axes
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.precision import (
     NoiseModel,
@@ -35,12 +33,14 @@ from cuspid.handpiece.precision import (
     noise_px,
 )
 from cuspid.handpiece.presets import PRESETS
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import TOOTH, Options, Range
-from cuspid.progress import Progress, silent
-from cuspid.rig import MountedCamera, Rig
-from cuspid.visibility import VisibilityOptions, visible_faces
+from cuspid.model.camera import Camera
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.model.visibility import VisibilityOptions, visible_faces
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import TOOTH, Options, Range
+from cuspid.runtime.progress import Progress, silent
 
 Direction = Literal["across", "along"]
 """How the baseline lies: across the arch (for a side of a tooth: up and down), or along it."""

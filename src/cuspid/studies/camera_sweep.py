@@ -24,31 +24,31 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cuspid import pipeline
 from cuspid.anatomy.surfaces import SURFACES, named_surfaces, tooth_axes
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions
-from cuspid.jaw import Jaw
+from cuspid.model.camera import Camera
+from cuspid.model.jaw import Jaw
+from cuspid.model.pairing import PairingOptions
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
+from cuspid.model.room import Room, check_clearance
+from cuspid.model.trueness import METRICS
 from cuspid.motion.location import MotionOptions
-from cuspid.options import TOOTH, Options, Range
-from cuspid.pairing import PairingOptions
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera, Rig
-from cuspid.room import Room, check_clearance
+from cuspid.mvs.across import AcrossOptions
+from cuspid.mvs.matching import StereoOptions
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import TOOTH, Options, Range
+from cuspid.runtime.progress import Progress, silent
 from cuspid.simulation.appearance import Preset
 from cuspid.simulation.path.detour import repaired
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
-from cuspid.stereo.across import AcrossOptions
-from cuspid.stereo.matching import StereoOptions
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import Trial, TrialOptions, run_trial
-from cuspid.trueness import METRICS
 
 Setting = tuple[float, float]
 """Baseline in mm and axis angle in degrees."""

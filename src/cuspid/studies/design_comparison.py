@@ -27,7 +27,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cuspid import pipeline, storage
+from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
 from cuspid.anatomy.mouth import MouthOptions, fit_pct, room_mm, study_mouths
 from cuspid.anatomy.phantom.build import build_phantom
@@ -37,21 +37,22 @@ from cuspid.anatomy.preparation.prepare import prepare, preset
 from cuspid.anatomy.shape.boxed import boxed
 from cuspid.anatomy.shape.mean import mean_shape
 from cuspid.anatomy.surfaces import named_surfaces
-from cuspid.camera import Camera
-from cuspid.errors import CuspidError, InputError
 from cuspid.evaluation.crown import open_faces
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.optimise import handpiece_outline
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import SEED, TOOTH, Options, Range
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece, Rig
+from cuspid.model.visibility import LEAST_OPENNESS
+from cuspid.pipeline import scan as pipeline
+from cuspid.runtime.errors import CuspidError, InputError
+from cuspid.runtime.options import SEED, TOOTH, Options, Range
+from cuspid.runtime.progress import Progress, silent
 from cuspid.simulation.path.scan import ScanPathOptions, steady_poses
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import TrialOptions, run_trial
-from cuspid.visibility import LEAST_OPENNESS
 
 Row = Mapping[str, Value]
 Outlines = tuple[Float[np.ndarray, "n 2"], ...]

@@ -12,11 +12,11 @@ from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.optimise import Design, SearchOptions, Section, optimise_handpiece
 from cuspid.handpiece.precision import NoiseModel, PrecisionMap, at_best, precision_map
-from cuspid.jaw import Jaw
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece
+from cuspid.model.visibility import Visibility, VisibilityOptions, survey_visibility
+from cuspid.runtime.progress import Progress, silent
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
-from cuspid.visibility import Visibility, VisibilityOptions, survey_visibility
 
 
 def design(

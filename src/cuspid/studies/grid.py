@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from cuspid import storage
-from cuspid.errors import CuspidError, InputError, MissingDependencyError
-from cuspid.progress import Progress, silent
-from cuspid.workers import core_numbers, keep_to_core, usable_cores
+from cuspid.runtime.errors import CuspidError, InputError, MissingDependencyError
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import core_numbers, keep_to_core, usable_cores
 
 Value = float | int | str | bool | None
 """What a cell of the table holds."""

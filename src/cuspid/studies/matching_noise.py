@@ -17,20 +17,20 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.capture import Frame
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.precision import deformation
 from cuspid.handpiece.presets import PRESETS
-from cuspid.jaw import Jaw
-from cuspid.options import SEED, TOOTH, Options, Range
-from cuspid.rig import Handpiece, Light, Lighting, MountedCamera
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.model.capture import Frame
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera
+from cuspid.mvs.matching import coarser, group_geometry
+from cuspid.mvs.rectification import IdealView
+from cuspid.mvs.refinement import SCORE, Q, RefinementOptions, image_noise, refine
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SEED, TOOTH, Options, Range
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.raycast import Scene, auto_gain, render_image
-from cuspid.stereo.matching import coarser, group_geometry
-from cuspid.stereo.rectification import IdealView
-from cuspid.stereo.refinement import SCORE, Q, RefinementOptions, image_noise, refine
 from cuspid.studies.camera_pair import (
     MATCHING,
     Matcher,

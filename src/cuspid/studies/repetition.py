@@ -18,21 +18,22 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Bool
 
-from cuspid import pipeline, storage
-from cuspid.capture import Capture
-from cuspid.errors import CuspidError, ReconstructionError
+from cuspid import storage
 from cuspid.evaluation.repeatability import PairOptions, Spread, compare_pair, spread
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
-from cuspid.pipeline import SimulationOptions
-from cuspid.progress import Progress, silent
-from cuspid.rig import Handpiece
+from cuspid.model.capture import Capture
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
+from cuspid.model.trueness import STATISTICS, GroundTruth
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import SimulationOptions
+from cuspid.runtime.errors import CuspidError, ReconstructionError
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.progress import Progress, silent
 from cuspid.simulation.path.scan import plan_scan_path
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import TrialOptions, run_trial
-from cuspid.trueness import STATISTICS, GroundTruth
 
 TRUENESS = ("mean_abs_um", "signed_mean_um", "std_um", "p95_um", "complete_50_um_pct")
 """Figures of a scan of which the spread is reported."""

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from cuspid import pipeline
-from cuspid.capture import Capture
-from cuspid.errors import ReconstructionError
 from cuspid.evaluation.deviation import EvaluationOptions, evaluate
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import fit
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.pipeline import ReconstructionOptions, SimulationOptions
-from cuspid.reconstruction import Reconstruction
-from cuspid.rig import Handpiece
-from cuspid.trueness import METRICS, GroundTruth, Trueness
-from cuspid.visibility import VisibilityOptions
+from cuspid.model.capture import Capture
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import Reconstruction
+from cuspid.model.rig import Handpiece
+from cuspid.model.trueness import METRICS, GroundTruth, Trueness
+from cuspid.model.visibility import VisibilityOptions
+from cuspid.pipeline import scan as pipeline
+from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
+from cuspid.runtime.errors import ReconstructionError
 
 Shoot = Callable[[Path], tuple[Capture, GroundTruth]]
 """Writes images to a folder."""

@@ -12,8 +12,6 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.camera import Camera, project_orthographic
-from cuspid.epipolar import epipolar_lines, epipolar_residuals, fundamental_matrix, projection_matrix, skew
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.precision import (
     NoiseModel,
@@ -22,7 +20,9 @@ from cuspid.handpiece.precision import (
     planar_pair_bound,
     projection_jacobian,
 )
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import Camera, project_orthographic
+from cuspid.model.epipolar import epipolar_lines, epipolar_residuals, fundamental_matrix, projection_matrix, skew
+from cuspid.model.rig import MountedCamera
 from cuspid.studies.camera_pair import CameraPairOptions, camera_pair
 from cuspid_thesis.results import Figures
 

@@ -16,15 +16,15 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.preparation.prepare import preset
 from cuspid.anatomy.shape.boxed import boxed, crown_boxes
 from cuspid.anatomy.surfaces import SURFACES
-from cuspid.camera import Camera
-from cuspid.epipolar import epipolar_residuals, fundamental_matrix, projection_matrix
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
-from cuspid.jaw import Jaw
-from cuspid.motion.features import detect
-from cuspid.motion.pairs import match_unguided
-from cuspid.rig import Handpiece
+from cuspid.model.camera import Camera
+from cuspid.model.epipolar import epipolar_residuals, fundamental_matrix, projection_matrix
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece
+from cuspid.motion.frontend.features import detect
+from cuspid.motion.frontend.pairs import match_unguided
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.simulation.path.scan import ScanPathOptions, steady_poses

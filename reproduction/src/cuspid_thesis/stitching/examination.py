@@ -16,7 +16,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.options import Options, Range
+from cuspid.runtime.options import Options, Range
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int16, UInt8
 
-from cuspid.camera import Camera, undistortion_maps
-from cuspid.errors import ReconstructionError
-from cuspid.image_sequence import ImageSequence
-from cuspid.options import Options, Range
-from cuspid.panorama import FrameUse, Panorama
-from cuspid.progress import Progress, silent
-from cuspid.workers import map_in_threads
+from cuspid.model.camera import Camera, undistortion_maps
+from cuspid.model.image_sequence import ImageSequence
+from cuspid.model.panorama import FrameUse, Panorama
+from cuspid.runtime.errors import ReconstructionError
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import map_in_threads
 from cuspid_thesis.stitching.examination import ExaminationOptions, examine, frame_corners, scale_of, warp
 from cuspid_thesis.stitching.normal_map import grey_normal_map, normal_map, rectify
 from cuspid_thesis.stitching.placing import Blend, Canvas, Placed

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int16, UInt8
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.kernels import kernel
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET
+from cuspid.runtime.kernels import kernel
 from cuspid_thesis.stitching.examination import frame_corners, warp
 from cuspid_thesis.stitching.warps import SEGMENT_PX, centroids
 

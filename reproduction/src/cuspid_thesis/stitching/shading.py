@@ -28,9 +28,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from cuspid.camera import Camera
-from cuspid.kernels import kernel
-from cuspid.options import Options, Range
+from cuspid.model.camera import Camera
+from cuspid.runtime.kernels import kernel
+from cuspid.runtime.options import Options, Range
 
 _COARSEST_PX = 60
 """The iteration starts on an image whose shorter side has at least this many px, and doubles it."""

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float, Int, Int16
 from skimage.segmentation import felzenszwalb
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET
-from cuspid.options import Options, Range
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET
+from cuspid.runtime.options import Options, Range
 
 SEGMENT_PX = 4
 """Segments are found on a normal map that is smaller by this factor."""

@@ -19,8 +19,8 @@ from types import MappingProxyType
 import numpy as np
 
 from cuspid.anatomy.landmarks.scheme import teeth_named
-from cuspid.errors import CuspidError, InputError, OutputError
-from cuspid.jaw import Arch, Jaw, Landmark
+from cuspid.model.jaw import Arch, Jaw, Landmark
+from cuspid.runtime.errors import CuspidError, InputError, OutputError
 
 DIMENSIONS = ("a", "b", "c", "f", "f_first")
 """Names of the dimensions, in the order of tables."""

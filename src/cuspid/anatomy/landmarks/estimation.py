@@ -40,11 +40,11 @@ from cuspid.anatomy.landmarks.scheme import (
 )
 from cuspid.anatomy.landmarks.tooth_view import Place, ToothView, view_teeth
 from cuspid.anatomy.teeth.dentition import QUADRANTS
-from cuspid.errors import InputError
 from cuspid.geometry import unit
-from cuspid.jaw import GUM, Arch, Jaw, Landmark
-from cuspid.mesh import Mesh, edges_of
-from cuspid.options import Options, Range
+from cuspid.model.jaw import GUM, Arch, Jaw, Landmark
+from cuspid.model.mesh import Mesh, edges_of
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]

@@ -18,10 +18,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import UNIVERSAL_FROM_FDI, Landmark
-from cuspid.values import shown
+from cuspid.model.jaw import UNIVERSAL_FROM_FDI, Landmark
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import shown
 
 ToothKind = Literal["incisor", "canine", "premolar", "molar"]
 

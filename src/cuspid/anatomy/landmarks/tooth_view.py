@@ -20,10 +20,10 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CloughTocher2DInterpolator, RegularGridInterpolator
 from scipy.ndimage import correlate1d, distance_transform_edt, gaussian_filter, maximum_filter
 
-from cuspid.facing import pieces_of
 from cuspid.geometry import unit
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
+from cuspid.model.facing import pieces_of
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
 
 Grid = Float[np.ndarray, "p q"]
 Place = Float[np.ndarray, "2"]

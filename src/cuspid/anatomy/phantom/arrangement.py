@@ -1,7 +1,7 @@
 """Where the teeth of a phantom stand: in a row, touching, with the asked widths and length of the arch.
 
-Frames. *Jaw*: the occlusal frame of `cuspid.jaw`. Seen along -Z with +Y up, +X points right; that is the patient's
-right in a lower jaw (teeth 41-47) and the patient's left in an upper one (teeth 21-27). *Tooth*: see
+Frames. *Jaw*: the occlusal frame of `cuspid.model.jaw`. Seen along -Z with +Y up, +X points right; that is the
+patient's right in a lower jaw (teeth 41-47) and the patient's left in an upper one (teeth 21-27). *Tooth*: see
 `cuspid.anatomy.teeth.crowns`; the frame of a tooth with X < 0 is left-handed, for it is the mirror image of its
 counterpart.
 
@@ -23,8 +23,8 @@ from cuspid.anatomy.phantom.crown_points import Point, crown_point
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.teeth.crowns import Crown, Points, crown_distance, silhouettes, top_of
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS, QUADRANTS, Tooth
-from cuspid.errors import InputError
-from cuspid.jaw import Arch
+from cuspid.model.jaw import Arch
+from cuspid.runtime.errors import InputError
 
 CONTACT_OVERLAP_MM = 0.07
 """Neighbours overlap by this much, beside the rounding of creases: contact points are worn to small areas."""

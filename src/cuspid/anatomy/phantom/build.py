@@ -23,9 +23,9 @@ from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.solid import Solid
 from cuspid.anatomy.phantom.surface_points import landmarks_of, papilla
 from cuspid.anatomy.teeth.crowns import Points
-from cuspid.graph import parts_of
-from cuspid.jaw import Jaw, Landmark
-from cuspid.mesh import Mesh, edges_of
+from cuspid.geometry.graph import parts_of
+from cuspid.model.jaw import Jaw, Landmark
+from cuspid.model.mesh import Mesh, edges_of
 
 
 def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from cuspid.anatomy.phantom.arrangement import PlacedTooth
 from cuspid.anatomy.teeth.crowns import Crown, Points, Values, silhouettes, smooth_max, smooth_min
 from cuspid.geometry import lengths_along
-from cuspid.workers import computed_once
+from cuspid.runtime.workers import computed_once
 
 ROOT = 0.7
 """Length of the root that is modelled, as a fraction of the crown height; it ends inside the gum."""

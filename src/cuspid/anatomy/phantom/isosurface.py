@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 
 from cuspid.anatomy.teeth.crowns import Points, Values
-from cuspid.graph import graph_of, parts_of
-from cuspid.mesh import edges_of
+from cuspid.geometry.graph import graph_of, parts_of
+from cuspid.model.mesh import edges_of
 
 Field = Callable[[Points], Values]
 """Signed distance in mm, shape (n,), of points (n, 3); negative inside."""

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from cuspid.jaw import Arch
-from cuspid.options import SEED, TOOTH, Options, Range
+from cuspid.model.jaw import Arch
+from cuspid.runtime.options import SEED, TOOTH, Options, Range
 
 COARSEST_MM = 2.0
 """A grid that is coarser misses teeth."""

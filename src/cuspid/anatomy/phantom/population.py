@@ -25,8 +25,8 @@ import numpy as np
 
 from cuspid.anatomy.phantom.arrangement import can_stand
 from cuspid.anatomy.phantom.options import PhantomOptions
-from cuspid.errors import InputError
-from cuspid.jaw import Arch
+from cuspid.model.jaw import Arch
+from cuspid.runtime.errors import InputError
 
 GroupName = Literal["lower-14", "upper-14", "lower-12", "upper-12"]
 

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from cuspid.anatomy.phantom.arrangement import PlacedTooth
 from cuspid.anatomy.phantom.gum import Gum, above_root_end, collar
 from cuspid.anatomy.teeth.crowns import Points, Values, crown_distance, smooth_min
-from cuspid.jaw import GUM
+from cuspid.model.jaw import GUM
 
 FAR_MM = 3.0
 """Distance that stands for all larger ones."""

@@ -1,8 +1,8 @@
 """The sphere arch: a horseshoe with a sphere at each tooth position, to measure a scanner by.
 
-Frame: the occlusal frame of `cuspid.jaw`, mm. The spheres stand on the mean arch form, the beta function of S. Braun,
-W. P. Hnat, D. E. Fender and H. L. Legan, *The form of the human dental arch* (Angle Orthod. 68, 1998): with W the width
-between the second molars and D the depth of the arch,
+Frame: the occlusal frame of `cuspid.model.jaw`, mm. The spheres stand on the mean arch form, the beta function of S.
+Braun, W. P. Hnat, D. E. Fender and H. L. Legan, *The form of the human dental arch* (Angle Orthod. 68, 1998): with W
+the width between the second molars and D the depth of the arch,
 
     y = 3.0314 D (1/2 + x/W)^0.8 (1/2 - x/W)^0.8
 
@@ -23,11 +23,11 @@ from manifold3d import Error, Manifold, Mesh64, OpType
 from scipy.interpolate import CubicSpline
 
 from cuspid.anatomy.teeth.dentition import ARCH_FORMS, ArchForm
-from cuspid.errors import InputError
 from cuspid.geometry import lengths_along
-from cuspid.jaw import GUM, Arch, Jaw, Sphere
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
+from cuspid.model.jaw import GUM, Arch, Jaw, Sphere
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 _POSITIONS = 7
 """Spheres of a quadrant."""

@@ -18,7 +18,7 @@ from cuspid.anatomy.phantom.gum import margin_height
 from cuspid.anatomy.phantom.isosurface import newton_step, value_and_gradient
 from cuspid.anatomy.phantom.solid import CREASE_MM, Solid
 from cuspid.anatomy.teeth.crowns import Points, Values, crown_distance, silhouettes
-from cuspid.jaw import Arch, Landmark
+from cuspid.model.jaw import Arch, Landmark
 
 PAPILLA_ABOVE_MM = 0.35
 """Height of the centre of the incisive papilla above the cervices of the upper central incisors, in the middle of which

@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from cuspid.anatomy.booleans import CAVITY, OUTSIDE, Tool
 from cuspid.anatomy.preparation.tooth_site import ToothSite, outward
-from cuspid.errors import InputError
 from cuspid.geometry import lengths_along
+from cuspid.runtime.errors import InputError
 
 WANDER_MM = 0.18
 """How far the slit strays to either side."""

@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from cuspid.anatomy.booleans import CAVITY, OUTSIDE, ROOT, TROUGH, Tool
 from cuspid.anatomy.preparation.tooth_site import TURNS, Heights, ToothSite, round_means
 from cuspid.anatomy.teeth.crowns import smooth_max, smooth_min, smooth_step
-from cuspid.errors import InputError
 from cuspid.geometry import lengths_along
-from cuspid.mesh import Mesh, edges_of
+from cuspid.model.mesh import Mesh, edges_of
+from cuspid.runtime.errors import InputError
 
 EMERGENCE = 0.09
 """How far the proximal side at the finish line stands back from the contact, as a share of the crown's width: two

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from cuspid.anatomy.booleans import CAVITY, TROUGH, Tool, run_lengths
 from cuspid.anatomy.preparation.crown_tool import EMERGENCE, SULCUS_MM
 from cuspid.anatomy.preparation.tooth_site import ToothSite
-from cuspid.errors import InputError
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
 
 _ROUND = 24
 """Segments of a full turn of a rounded edge."""

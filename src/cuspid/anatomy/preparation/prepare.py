@@ -1,6 +1,6 @@
 """Prepared teeth: cracks, crown preparations and inlays cut into a labelled jaw by exact booleans.
 
-Frame: the occlusal frame of `cuspid.jaw`, mm. Each preparation is a tool in the frame of its tooth
+Frame: the occlusal frame of `cuspid.model.jaw`, mm. Each preparation is a tool in the frame of its tooth
 (`cuspid.anatomy.preparation.tooth_site`), whose axis is the long axis of the crown and the path of insertion. All tools
 are taken away from the jaw; the result is closed (an open scan stays open at its own borders), its new faces carry
 labels, and the edge of each preparation is kept as a line on the surface: ``45.margin``, ``46.crack``.
@@ -32,11 +32,11 @@ from cuspid.anatomy.preparation.crack_tool import CrackShape, crack_tool
 from cuspid.anatomy.preparation.crown_tool import CrownShape, crown_tool
 from cuspid.anatomy.preparation.inlay_tool import InlayShape, inlay_tool
 from cuspid.anatomy.preparation.tooth_site import ToothSite, site_of
-from cuspid.errors import InputError
-from cuspid.graph import parts_of
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
+from cuspid.geometry.graph import parts_of
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 _OVERLAP_MM = 0.005
 

@@ -16,11 +16,11 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filt
 from scipy.spatial import cKDTree
 
 from cuspid.anatomy.landmarks.scheme import ToothKind, kind_of
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh, edges_of
-from cuspid.workers import computed_once
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh, edges_of
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.workers import computed_once
 
 TURNS = 240
 """Directions round the axis in which a tooth is described."""

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cuspid.anatomy.booleans import closed, solid_of
-from cuspid.errors import InputError
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
 
 _ARCH_ORDER = (*range(48, 40, -1), *range(31, 39), *range(18, 10, -1), *range(21, 29))
 """FDI numbers along the lower and the upper arch."""

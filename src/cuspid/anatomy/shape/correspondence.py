@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from scipy.stats import binom
 
 from cuspid.anatomy.shape.procrustes import dimension
-from cuspid.jaw import GUM
-from cuspid.mesh import Mesh, edges_of
-from cuspid.options import Options, Range
+from cuspid.model.jaw import GUM
+from cuspid.model.mesh import Mesh, edges_of
+from cuspid.runtime.options import Options, Range
 
 _ON_BORDER = 0.7
 """A partner on the rim of a patch counts only if the line to it leaves the patch at least this steeply (sine)."""

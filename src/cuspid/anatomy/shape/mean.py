@@ -23,13 +23,13 @@ from jaxtyping import Float
 
 from cuspid.anatomy.shape.correspondence import Fit, FitOptions, Target, Template, fit, labels_or_gum, warp
 from cuspid.anatomy.shape.procrustes import Superposition, dimension, superpose
-from cuspid.errors import InputError
-from cuspid.jaw import Jaw, Landmark
-from cuspid.mesh import Mesh
-from cuspid.options import Options, Range
-from cuspid.progress import Progress, silent
-from cuspid.shape_model import MeanStep, ShapeModel
-from cuspid.workers import map_in_threads
+from cuspid.model.jaw import Jaw, Landmark
+from cuspid.model.mesh import Mesh
+from cuspid.model.shape_model import MeanStep, ShapeModel
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import Options, Range
+from cuspid.runtime.progress import Progress, silent
+from cuspid.runtime.workers import map_in_threads
 
 _NO_VARIANCE = 1e-12
 """Modes with a smaller share of the variance than this are rounding."""

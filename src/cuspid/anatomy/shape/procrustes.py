@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.errors import InputError
 from cuspid.geometry import best_similarity
+from cuspid.runtime.errors import InputError
 
 _MOST_ROUNDS = 1000
 _STILL = 1e-13

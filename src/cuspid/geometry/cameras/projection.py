@@ -8,7 +8,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.kernels import kernel
+from cuspid.runtime.kernels import kernel
 
 _OPENCV, _FULL_OPENCV, _OPENCV_FISHEYE = 0, 1, 2
 _STEPS, _SETTLED = 30, 1e-14

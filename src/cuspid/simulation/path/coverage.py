@@ -2,7 +2,7 @@
 
 Whether something occludes a point is looked up in its *sky*, the directions in which nothing stands within reach, so
 that thousands of poses are evaluated at the cost of one round of rays. The evaluation of a plan casts actual rays:
-:func:`cuspid.visibility.visible_counts`.
+:func:`cuspid.model.visibility.visible_counts`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from cuspid.arch_curve import ArchCurve
 from cuspid.geometry import Rigid3, composed
-from cuspid.jaw import GUM, Jaw
-from cuspid.kernels import kernel
-from cuspid.rig import Handpiece
-from cuspid.visibility import LEAST_OPENNESS, OPENNESS_REACH_MM, openness, slope_bounds
+from cuspid.model.arch_curve import ArchCurve
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.rig import Handpiece
+from cuspid.model.visibility import LEAST_OPENNESS, OPENNESS_REACH_MM, openness, slope_bounds
+from cuspid.runtime.kernels import kernel
 
 _AREA_MM2 = 0.7
 """Area of the surface that each point represents."""
 _DIRECTIONS = 256
 _LEAST_COSINE = float(np.cos(np.deg2rad(75.0)))
-"""Minimum cosine of the incidence at which a point is seen; as in :mod:`cuspid.visibility`."""
+"""Minimum cosine of the incidence at which a point is seen; as in :mod:`cuspid.model.visibility`."""
 _ASIDE_MM, _BELOW_MM = 7.0, 8.0
 """Without labels, crowns are what lies this near to the arch, seen from above, and this far below its line."""
 

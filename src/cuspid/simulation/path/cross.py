@@ -19,11 +19,11 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
-from cuspid.arch_curve import ArchCurve
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece
-from cuspid.room import Room
+from cuspid.model.arch_curve import ArchCurve
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
+from cuspid.model.room import Room
 from cuspid.simulation.path.detour import eased, least_lifts, up
 from cuspid.simulation.path.overlap import image_overlap
 

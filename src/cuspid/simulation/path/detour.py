@@ -23,10 +23,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation, gaussian_filter1d, label, maximum_filter1d
 
 from cuspid.geometry import Rigid3
-from cuspid.rig import Handpiece
-from cuspid.room import FAR_MM, Room
+from cuspid.model.rig import Handpiece
+from cuspid.model.room import FAR_MM, Room
+from cuspid.runtime.workers import map_in_threads
 from cuspid.simulation.path.coverage import CrownPoints
-from cuspid.workers import map_in_threads
 
 PoseAt = Callable[[float], Rigid3]
 """``rig_from_world`` at a given travel."""

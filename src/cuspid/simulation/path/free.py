@@ -1,8 +1,8 @@
 """The trajectory of a camera that a shaky hand moves over the teeth, unrestricted (thesis chapter 4, Fig. 4.2).
 
-The steady trajectory is the arch curve of :mod:`cuspid.arch_curve`, from the first crown to the last, or goes on from
-there so that places are seen again, or swings to either side. The hand adds a random shift, tilt and rotation to it,
-and moves at a random speed. Each of these is smooth noise over the frames: a slow drift and a quick tremor, both
+The steady trajectory is the arch curve of :mod:`cuspid.model.arch_curve`, from the first crown to the last, or goes on
+from there so that places are seen again, or swings to either side. The hand adds a random shift, tilt and rotation to
+it, and moves at a random speed. Each of these is smooth noise over the frames: a slow drift and a quick tremor, both
 Gaussian and together of the given standard deviation, and never beyond `REACH` of it, because whoever holds the camera
 watches the picture. The camera is shifted and rotated about the place on the teeth that it looks at, in the rig frame:
 X along the arch, Y towards the cheek, Z out of the gum.
@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from cuspid.arch_curve import ArchCurve, arch_curve
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.options import SHARE, Options, Range
-from cuspid.rig import Handpiece
-from cuspid.room import Room, room_about
+from cuspid.model.arch_curve import ArchCurve, arch_curve
+from cuspid.model.jaw import Jaw
+from cuspid.model.rig import Handpiece
+from cuspid.model.room import Room, room_about
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SHARE, Options, Range
 from cuspid.simulation.path.cross import plan_crossing
 from cuspid.simulation.path.detour import eased, least_lifts, repaired, up
 

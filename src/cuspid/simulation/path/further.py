@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece
-from cuspid.room import Room
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
+from cuspid.model.room import Room
 from cuspid.simulation.path.coverage import CrownPoints
 from cuspid.simulation.path.detour import up
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path

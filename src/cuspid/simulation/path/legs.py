@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter
 
-from cuspid.arch_curve import NEAR_MM, ArchCurve
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
+from cuspid.model.arch_curve import NEAR_MM, ArchCurve
+from cuspid.model.mesh import Mesh
 from cuspid.simulation.path.cross import Crossing
 
 _SIDE_DEG, _SIDE_MM = 60.0, (4.5, 2.5)

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.rig import Handpiece
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
 
 _LEAST_SURFACE = 0.1
 """An image with surface on a smaller share of it is not evaluated."""

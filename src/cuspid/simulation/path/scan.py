@@ -20,14 +20,14 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.arch_curve import ArchCurve, arch_curve
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.jaw import GUM, Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import TOOTH, Options, Range
-from cuspid.rig import Handpiece
-from cuspid.room import Room, room_about
+from cuspid.model.arch_curve import ArchCurve, arch_curve
+from cuspid.model.jaw import GUM, Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
+from cuspid.model.room import Room, room_about
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import TOOTH, Options, Range
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.cross import plan_crossing
 from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour, repaired

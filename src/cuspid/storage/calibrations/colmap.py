@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera, Rig
+from cuspid.model.camera import Camera
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name, shown
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints
 from cuspid.storage.calibrations.lenses import ALL, Lens
@@ -23,7 +24,6 @@ from cuspid.storage.handpieces import (
     rig_to_config,
     rigid_from_json,
 )
-from cuspid.values import checked_name, shown
 
 LENSES: tuple[Lens, ...] = ALL
 

@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from cuspid.errors import InputError
-from cuspid.values import one_line
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import one_line
 
 _MOST_CHARACTERS = 16 << 20
 _MOST_VALUES = 1_000_000

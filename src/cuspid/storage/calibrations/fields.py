@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import MODELS
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import LONGEST_MM, MOST_PX, number, numbers, shown, whole
 from cuspid.storage.calibrations.lenses import Loss
 from cuspid.storage.units import Unit
-from cuspid.values import LONGEST_MM, MOST_PX, number, numbers, shown, whole
 
 _MOST_DISTORTION = 1e4
 _MOST_FOCAL_PX = 100.0 * MOST_PX

@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import Camera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name, number, shown
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, vector
 from cuspid.storage.calibrations.lenses import Lens, Loss, of_projection
-from cuspid.values import checked_name, number, shown
 
 LENSES: tuple[Lens, ...] = ()
 _FIELD = re.compile(r"^\s*([A-Za-z]\w*)\s*:\s*\w+\s*:\s*([^;:]+?)\s*;", re.MULTILINE)

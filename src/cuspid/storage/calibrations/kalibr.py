@@ -10,15 +10,15 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import MODELS
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name, shown
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, mapped, motion, vector
 from cuspid.storage.calibrations.lenses import BROWN_4, FISHEYE, Lens, Loss, of_projection
-from cuspid.values import checked_name, shown
 
 LENSES: tuple[Lens, ...] = (BROWN_4, FISHEYE)
 _EXTRA = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry.cameras import MODELS, project_points, projection_derivatives
+from cuspid.model.camera import Camera
+from cuspid.runtime.errors import InputError
 
 _ACROSS, _DOWN = 41, 31
 """Pixels of an image at which lenses are compared."""

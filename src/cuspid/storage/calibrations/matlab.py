@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import Camera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import shown
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import (
     Calibration,
@@ -30,7 +31,6 @@ from cuspid.storage.calibrations.fields import (
 )
 from cuspid.storage.calibrations.lenses import BROWN_5, Lens
 from cuspid.storage.units import Unit
-from cuspid.values import shown
 
 LENSES: tuple[Lens, ...] = (BROWN_5,)
 _PIXEL_OFFSET = -0.5

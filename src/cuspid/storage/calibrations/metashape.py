@@ -11,15 +11,15 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import Camera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name, number, shown
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, motion
 from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE_TANGENTIAL, Lens, Loss, of_projection
 from cuspid.storage.units import Unit
-from cuspid.values import checked_name, number, shown
 
 LENSES: tuple[Lens, ...] = (BROWN_5, FISHEYE_TANGENTIAL)
 _MOST = 1e6

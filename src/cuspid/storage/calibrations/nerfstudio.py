@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from cuspid.camera import Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import Camera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name, number, shown
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, listed, mapped, motion
 from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, Lens, Loss, of_projection
-from cuspid.values import checked_name, number, shown
 
 LENSES: tuple[Lens, ...] = (BROWN_5, FISHEYE)
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera
+from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import (
     Calibration,
@@ -31,7 +32,6 @@ from cuspid.storage.calibrations.fields import (
     vector,
 )
 from cuspid.storage.calibrations.lenses import FISHEYE, RATIONAL, Lens, Loss, of_projection
-from cuspid.values import checked_name
 
 LENSES: tuple[Lens, ...] = (RATIONAL, FISHEYE)
 _MEANINGS = {

@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-from cuspid.errors import InputError, OutputError
-from cuspid.inputs import read_text
-from cuspid.rig import MountedCamera, Rig
+from cuspid.model.rig import MountedCamera, Rig
+from cuspid.runtime.errors import InputError, OutputError
+from cuspid.runtime.inputs import read_text
 from cuspid.storage.calibrations import colmap, halcon, kalibr, matlab, metashape, nerfstudio, opencv, ros, tables
 from cuspid.storage.calibrations.documents import Document, parse
 from cuspid.storage.calibrations.fields import Calibration, Hints, scaled

@@ -12,9 +12,10 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name, shown
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import (
     Calibration,
@@ -30,7 +31,6 @@ from cuspid.storage.calibrations.fields import (
 )
 from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, RATIONAL, Lens
 from cuspid.storage.calibrations.opencv import coefficients_of
-from cuspid.values import checked_name, shown
 
 LENSES: tuple[Lens, ...] = (BROWN_5, RATIONAL, FISHEYE)
 _MOST_P = 1e9

@@ -9,9 +9,10 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from cuspid.errors import InputError
 from cuspid.geometry import Rigid3
-from cuspid.rig import MountedCamera
+from cuspid.model.rig import MountedCamera
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.values import checked_name
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import (
     Calibration,
@@ -26,7 +27,6 @@ from cuspid.storage.calibrations.fields import (
 )
 from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, Lens
 from cuspid.storage.calibrations.opencv import coefficients_of
-from cuspid.values import checked_name
 
 LENSES: tuple[Lens, ...] = (BROWN_5, FISHEYE)
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cuspid import storage
-from cuspid.errors import InputError
-from cuspid.inputs import is_there
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.inputs import is_there
 from cuspid.storage import MARKUPS_SUFFIX, MESH_SUFFIXES
 from cuspid.storage.files import finished
 

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from cuspid.errors import MissingDependencyError
+from cuspid.runtime.errors import MissingDependencyError
 
 LEVEL = 0.95
 """Of all intervals."""

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from cuspid import storage
-from cuspid.errors import InputError
 from cuspid.evaluation.alignments import AlignmentKind, align_on_area, align_points
 from cuspid.evaluation.deformation import fit_deformation
 from cuspid.evaluation.distance import SignedDistance
@@ -22,11 +21,12 @@ from cuspid.evaluation.scan_bodies import BodyFit, BodyOptions, fit_body
 from cuspid.evaluation.spans import Station, angle_between_deg, spans
 from cuspid.evaluation.spheres import SphereOptions, evaluate_spheres
 from cuspid.evaluation.teeth import ScannedTooth, find_teeth
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
-from cuspid.mesh import Mesh
-from cuspid.options import SEED, SHARE, TOOTH, Options, Range
+from cuspid.model.facing import facing_outwards
+from cuspid.model.jaw import Jaw
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.options import SEED, SHARE, TOOTH, Options, Range
 from cuspid.storage import MeasuredFile
 from cuspid.storage.files import write_arrays
 from cuspid.studies.scanners.files import ScanFile

@@ -19,20 +19,20 @@ from cuspid.anatomy.crowns import crowns_of
 from cuspid.anatomy.jaw_files import Labelling, named_arch
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.anatomy.surfaces import SURFACES, named_surfaces
-from cuspid.arch_curve import ArchCurve, arch_curve
-from cuspid.errors import CuspidError, InputError
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import Places, scatter
 from cuspid.evaluation.scan_bodies import fit_body
 from cuspid.evaluation.teeth import ARCH_ORDER
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
-from cuspid.jaw import GUM, Arch, Jaw, Sphere
-from cuspid.mesh import Mesh
+from cuspid.model.arch_curve import ArchCurve, arch_curve
+from cuspid.model.facing import facing_outwards
+from cuspid.model.jaw import GUM, Arch, Jaw, Sphere
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import CuspidError, InputError
+from cuspid.runtime.values import LONGEST_MM, number
 from cuspid.storage import MM_PER_UNIT, MeasuredFile, Unit
 from cuspid.storage.files import read_arrays, write_arrays
 from cuspid.studies.scanners.files import area_file, beside, body_file, landmark_file
-from cuspid.values import LONGEST_MM, number
 
 PLACES = 60_000
 """Number of places on a reference."""

@@ -16,10 +16,10 @@ import numpy as np
 
 from cuspid import storage
 from cuspid.anatomy.jaw_files import Labelling
-from cuspid.errors import CuspidError, InputError
 from cuspid.evaluation.distance import SignedDistance
-from cuspid.jaw import Arch
-from cuspid.progress import Progress, silent
+from cuspid.model.jaw import Arch
+from cuspid.runtime.errors import CuspidError, InputError
+from cuspid.runtime.progress import Progress, silent
 from cuspid.storage.files import to_plain, write_arrays
 from cuspid.storage.stages import Stage, code_version
 from cuspid.studies.grid import Case, Value, run_grid

@@ -17,14 +17,14 @@ from jaxtyping import Bool, Float
 
 from cuspid import storage
 from cuspid.anatomy.surfaces import SURFACES
-from cuspid.errors import InputError
 from cuspid.evaluation.deviation import statistics
 from cuspid.evaluation.places import Places, SmallMotion, best_motion
 from cuspid.evaluation.repeatability import PairOptions, compare_pair
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3
-from cuspid.mesh import Mesh
-from cuspid.progress import Progress, silent
+from cuspid.model.facing import facing_outwards
+from cuspid.model.mesh import Mesh
+from cuspid.runtime.errors import InputError
+from cuspid.runtime.progress import Progress, silent
 from cuspid.storage.files import read_arrays
 from cuspid.studies.scanners.files import Remark, ScanFile
 from cuspid.studies.scanners.scan import BEYOND, Measured, StudyOptions

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from cuspid import storage
-from cuspid.mesh import Mesh
+from cuspid.model.mesh import Mesh
 from cuspid.storage.files import read_arrays, write_arrays
 from cuspid.studies.scanners.files import ScanFile
 from cuspid.studies.scanners.specimen import Specimen

@@ -1,6 +1,0 @@
-"""Boards that cameras are calibrated from: what is printed on them, and where."""
-
-from cuspid.board.boards import Board, BoardKind, BoardPattern, Dictionary
-from cuspid.board.sets import BoardSet, Target
-
-__all__ = ["Board", "BoardKind", "BoardPattern", "BoardSet", "Dictionary", "Target"]

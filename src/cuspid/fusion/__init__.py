@@ -1,0 +1,6 @@
+"""From depth maps to one clean mesh."""
+
+from cuspid.fusion.cleaning import CleaningOptions, CleaningReport, clean
+from cuspid.fusion.depth_fusion import FusionOptions, fuse
+
+__all__ = ["CleaningOptions", "CleaningReport", "FusionOptions", "clean", "fuse"]

@@ -1,0 +1,1 @@
+"""The body of a handpiece as a solid that can be printed."""

@@ -1,0 +1,1 @@
+"""The nouns: rig, camera, capture, mesh, jaw, board, reconstruction, trueness, panorama; and what the cameras see."""

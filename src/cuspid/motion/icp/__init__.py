@@ -1,0 +1,1 @@
+"""Poses from measured surfaces, for teeth without texture: how they lie on each other."""

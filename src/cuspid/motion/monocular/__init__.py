@@ -1,0 +1,1 @@
+"""One camera: where its photographs or frames were taken, and their scale."""
