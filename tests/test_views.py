@@ -155,6 +155,9 @@ def test_a_surface_is_one_piece_however_steep_and_what_stands_alone_is_none(tilt
     expected[20, 30] = False
     expected[5:8, 5:8] = False
     assert np.array_equal(kept, expected)
+    made_smooth = without_speckle(depth, resolution, options, np.ones(depth.shape, dtype=bool))
+    assert not made_smooth.any() or tilt_deg < 60
+    assert np.array_equal(made_smooth, expected) or tilt_deg > 30
 
 
 def test_only_the_part_of_a_view_that_has_weak_texture_is_made_smooth() -> None:
