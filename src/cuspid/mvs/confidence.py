@@ -200,32 +200,36 @@ def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOption
 
 
 def without_speckle(
-    depth_mm: Float[np.ndarray, "h w"], resolution: Resolution, options: ConfidenceOptions
+    depth_mm: Float[np.ndarray, "h w"],
+    resolution: Resolution,
+    options: ConfidenceOptions,
+    smooth: Bool[np.ndarray, "h w"] | None = None,
 ) -> Bool[np.ndarray, "h w"]:
     """True where a known depth belongs to a connected piece that is large enough. Neighbours are connected if they
     differ by little, or by as much as one of them does from its neighbour on the other side: a surface that falls away
-    from the camera is one piece, however steep."""
+    from the camera is one piece, however steep. That is not for what was made ``smooth``, which falls from one thing to
+    another one behind."""
     known = np.isfinite(depth_mm)
     jump = options.speckle_jump * resolution.mm / resolution.working_distance_mm
     level = np.log(depth_mm)
+    steep = np.ones(depth_mm.shape, dtype=bool) if smooth is None else ~smooth
     number = np.arange(depth_mm.size).reshape(depth_mm.shape)
     joined = [
-        np.stack([one[connected], other[connected]], axis=1)
-        for levels, one, other in (
-            (level, number[:, :-1], number[:, 1:]),
-            (level.T, number[:-1].T, number[1:].T),
-        )
-        for connected in [_continues(np.diff(levels, axis=1), jump)]
+        np.stack([of[:, :-1][connected], of[:, 1:][connected]], axis=1)
+        for of, levels, may in ((number, level, steep), (number.T, level.T, steep.T))
+        for connected in [_continues(np.diff(levels, axis=1), jump, may)]
     ]
     part = parts_of(np.concatenate(joined), depth_mm.size)
     return known & (np.bincount(part)[part] >= options.speckle_px).reshape(depth_mm.shape)
 
 
-def _continues(step: Float[np.ndarray, "h w"], jump: float) -> Bool[np.ndarray, "h w"]:
-    """Whether steps along rows are small or go on as the one before or the one behind; not where they are NaN."""
+def _continues(step: Float[np.ndarray, "h s"], jump: float, steep: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h s"]:
+    """Whether steps along rows are small or, where they may be ``steep``, go on as the one before or the one behind;
+    not where they are NaN."""
     with np.errstate(invalid="ignore"):
         alike = np.abs(np.diff(step, axis=1)) <= jump
         found = np.abs(step) <= jump
+    alike &= steep[:, :-2] & steep[:, 1:-1] & steep[:, 2:]
     found[:, 1:] |= alike
     found[:, :-1] |= alike
     return found

@@ -624,7 +624,7 @@ def checked_depth_map(
     speckle = replace(
         checks, speckle_px=min(checks.speckle_px, round(checks.speckle_px * (_SPACING_PX / grid_px) ** 2))
     )
-    keep = without_speckle(np.where(agreed, one.depth_mm, np.nan), resolution, speckle)
+    keep = without_speckle(np.where(agreed, one.depth_mm, np.nan), resolution, speckle, one.smooth)
     matched = counts & np.isfinite(one.depth_mm)
     funnel = Funnel(
         pixels=int(counts.sum()),
