@@ -1,4 +1,4 @@
-"""Damage small inputs in thousands of ways and see how readers and verbs take it (tests/fuzzing.py).
+"""Damage small inputs in thousands of ways and see how readers and verbs take it (tests/support/fuzzing.py).
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/fuzz.py [--cases 10000] [--first 0] [--only report] [--add]
 
@@ -21,7 +21,7 @@ from run import conditions
 from cuspid.storage import read_json, write_json
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent / "tests"))
+sys.path.insert(0, str(HERE.parent / "tests" / "support"))
 
 from fuzzing import SCENARIOS, Fuzzer  # noqa: E402
 

@@ -130,9 +130,9 @@ def fuzz(result: Result) -> str:
     return "\n".join(
         [
             "Small inputs with seeded damage: bytes, lines, numbers and names changed; files cut, emptied, left out or "
-            "swapped; and nonsense specific to a format (`tests/fuzzing.py`). Right is success, or one short line and "
-            "status 1 or 2. Wrong are tracebacks, more than 10 CPU seconds or 2 GiB, noise from libraries, and "
-            "anything left half-written or outside `--out`. Bar: 0 of 10,000. "
+            "swapped; and nonsense specific to a format (`tests/support/fuzzing.py`). Right is success, or one short "
+            "line and status 1 or 2. Wrong are tracebacks, more than 10 CPU seconds or 2 GiB, noise from libraries, "
+            "and anything left half-written or outside `--out`. Bar: 0 of 10,000. "
             f"`OPENBLAS_NUM_THREADS=1 python benchmarks/fuzz.py`, seeds {seeds}.",
             "",
             markdown_table(("what reads them", "cases", "wrong", "slowest, s"), rows),

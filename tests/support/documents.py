@@ -10,7 +10,7 @@ from pathlib import Path
 
 from markdown_it import MarkdownIt
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 GENERATED = ("api", "cli")
 NOT_RUN = re.compile(r"<!-- not run: .+ -->\s*$")
 COMMAND = re.compile(r"^(\$ )?cuspid [a-z]")

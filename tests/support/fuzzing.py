@@ -75,7 +75,7 @@ _NOISE = re.compile(r"Traceback|Warning:|corrupt|libpng|\[ ?WARN|\[ERROR|OpenCV|
 _OUT = "out"
 _SOURCES = Path(cli.__file__).parent.parent.parent
 """Results name no folder of this machine."""
-RESULTS = Path(__file__).parent.parent / "benchmarks" / "results"
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
 
 @dataclass(frozen=True)
