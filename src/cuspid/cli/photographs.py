@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from cuspid import storage
-from cuspid.cli.shared import console, show_progress
+from cuspid.cli.shared import console, print_expected, show_progress
 from cuspid.model.photographs import Photographs
 from cuspid.motion.colmap import hash_sparse
 from cuspid.pipeline import photographs as photograph_pipeline
@@ -47,11 +45,7 @@ def reconstruct_photographs(
     unit = "" if located.scale is not None else "; its scale is unknown: its lengths are not millimetres"
     console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces{unit}")
     if located.scale is not None:
-        middle, most = np.percentile(sigma_um, [50, 95])
-        console.print(
-            f"depths scatter by {middle:.1f} µm (median of the surface, one sigma; {most:.1f} for 95 % of it); errors "
-            "of the poses and of the lens are not in this"
-        )
+        print_expected(located.found, sigma_um)
 
 
 def _read_photographs(source: Path, out: Path, handpiece: Path | None, progress: Progress) -> Photographs:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -16,7 +15,17 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from cuspid import storage
 from cuspid.cli.photographs import reconstruct_photographs
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
+from cuspid.cli.shared import (
+    Flat,
+    Probe,
+    Source,
+    console,
+    load_probe,
+    load_source,
+    print_expected,
+    show_progress,
+    suited,
+)
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.margin import MarginError, cut_margins, margin_error
 from cuspid.evaluation.spheres import SphereReport, evaluate_spheres
@@ -26,7 +35,7 @@ from cuspid.model.capture import Capture
 from cuspid.model.facing import facing_outwards
 from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
-from cuspid.model.reconstruction import Expectation, Reconstruction
+from cuspid.model.reconstruction import Reconstruction
 from cuspid.model.rig import Handpiece
 from cuspid.model.tolerances import NominalOptions, is_nominal
 from cuspid.model.trueness import METRICS, STATISTICS, DeviationStatistics, Trueness
@@ -171,8 +180,7 @@ def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOpti
             mesh, sigma_um = pipeline.surface(capture, found, out, options, progress=progress)
         save_expected_picture(out / "expected.png", mesh, sigma_um)
     console.print(f"{out / 'mesh.ply'}: {len(mesh.faces):,} faces")
-    if found.expectation is not None:
-        _print_expected(found.expectation, sigma_um, found.told_by)
+    print_expected(found, sigma_um)
 
 
 def _evaluate(
@@ -325,18 +333,6 @@ def _print_nominal(handpiece: Handpiece, options: NominalOptions) -> None:
         f"{100 * assumed.focal_share:g} % in focal length, {assumed.centre_px:g} px in principal point and "
         f"{assumed.k1:g} in k1; change this with --nominal.*, or hold the calibration with --calibration fixed"
     )
-
-
-def _print_expected(expected: Expectation, sigma_um: Float[np.ndarray, "v"], told_by: str) -> None:
-    middle, most = np.percentile(sigma_um, [50, 95])
-    if expected.is_exact:
-        told = "the calibration, which states no uncertainty, and the poses are taken as exact"
-    else:
-        told = (
-            f"by {told_by}, scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm from end "
-            f"to end within {expected.span_sigma_um:.1f} µm"
-        )
-    console.print(f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); {told}")
 
 
 def _print_located(reconstruction: Reconstruction, capture: Capture) -> None:

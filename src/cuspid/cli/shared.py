@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
@@ -21,6 +22,7 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.handpiece.designs import DesignName, DesignOptions, build_handpiece
 from cuspid.model.jaw import Arch, Jaw
+from cuspid.model.reconstruction import Reconstruction
 from cuspid.model.rig import Handpiece
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import SEED, Options, Range
@@ -144,3 +146,19 @@ def suited(probe: Probe, texture: Preset) -> Probe:
     if plain:
         console.print("note: plain enamel takes coloured lights and crossed polarisers (--lights white for others)")
     return replace(probe, lights="colour-coded" if plain else "white")
+
+
+def print_expected(found: Reconstruction, sigma_um: Float[np.ndarray, "v"]) -> None:
+    """Tell how far a surface may be off; nothing where the poses do not tell it."""
+    expected = found.expectation
+    if expected is None:
+        return
+    middle, most = np.percentile(sigma_um, [50, 95])
+    if expected.is_exact:
+        told = "the calibration, which states no uncertainty, and the poses are taken as exact"
+    else:
+        told = (
+            f"by {found.told_by}, scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm "
+            f"from end to end within {expected.span_sigma_um:.1f} µm"
+        )
+    console.print(f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); {told}")

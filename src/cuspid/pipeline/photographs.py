@@ -24,6 +24,7 @@ from cuspid.model.reconstruction import Reconstruction
 from cuspid.model.rig import Handpiece, MountedCamera, Rig
 from cuspid.model.sparse_model import PhotoModel, Scale
 from cuspid.motion.colmap import hash_sparse, write_model
+from cuspid.motion.monocular.accuracy import expect_accuracy
 from cuspid.motion.monocular.photograph_poses import take_photograph_poses
 from cuspid.motion.monocular.photographs import PhotographOptions, locate_photographs
 from cuspid.motion.monocular.scale import (
@@ -122,8 +123,10 @@ def handed_over(model: PhotoModel, photographs: Photographs, scale: Scale | None
         rig=rig, working_distance_mm=middle, depth_range_mm=(near, far), name=photographs.source.name or "photographs"
     )
     capture = _capture(photographs, handpiece, own)
+    held = frozenset(name for name in own.cameras if _is_calibrated(photographs, name))
     found = Reconstruction(
         rig=rig,
+        expectation=expect_accuracy(own, 0.0 if scale is None else scale.sigma_share, held),
         rig_from_world=own.cam_from_world,
         tracks=own.tracks,
         dropped=own.dropped,
@@ -133,6 +136,10 @@ def handed_over(model: PhotoModel, photographs: Photographs, scale: Scale | None
         notes=(*own.notes, *(() if scale is None else scale.notes)),
     )
     return LocatedPhotographs(capture=capture, found=found, scale=scale)
+
+
+def _is_calibrated(photographs: Photographs, camera: str) -> bool:
+    return camera in photographs.cameras and photographs.cameras[camera].calibrated is not None
 
 
 def depth_range(depths: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
