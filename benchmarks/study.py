@@ -184,7 +184,7 @@ def at_one_end(work: Path, count: int) -> list[dict[str, Any]]:
             rng = np.random.default_rng(1)
             storage.write_mesh(file, Mesh(moved, mesh.faces).transformed(random_motion(rng)))
             scan = ScanFile(scanner="s", specimen=stem, scan=mode, path=file)
-            told = measure_file(scan, aligned, SignedDistance(mesh), StudyOptions(align="area")).told
+            told = measure_file(scan, aligned, StudyOptions(align="area")).told
             far = next(each for each in told["shifts"] if each["label"] == specimen.piece_name(last))
             there = specimen.places.points[specimen.piece == last]
             clamp = rigid_between(nearest, bent(nearest, specimen.curve, mode, um)).inverse()

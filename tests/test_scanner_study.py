@@ -143,12 +143,12 @@ def test_the_same_file_twice_counts_once(tmp_path):
 @pytest.mark.parametrize(("per_mm", "unit"), [(1.0, "mm"), (0.1, "cm"), (0.001, "m"), (1 / 25.4, "in"), (1000.0, "um")])
 def test_the_unit_of_a_file_is_told_by_its_reference(tmp_path, jaw, per_mm, unit):
     put(tmp_path, "a.stl", Mesh(jaw.mesh.vertices * per_mm, jaw.mesh.faces))
-    found, odd = guessed_unit(tmp_path / "a.stl", like_mm=60.0)
+    found, odd = guessed_unit(tmp_path / "a.stl", storage.read_mesh(tmp_path / "a.stl"), like_mm=60.0)
     assert found == unit
     assert (odd is None) == (unit == "mm")
     put(tmp_path, "b.stl", Mesh(jaw.mesh.vertices * 25.4, jaw.mesh.faces))
     with pytest.raises(InputError, match="no size of teeth or jaws"):
-        guessed_unit(tmp_path / "b.stl", like_mm=60.0)
+        guessed_unit(tmp_path / "b.stl", storage.read_mesh(tmp_path / "b.stl"), like_mm=60.0)
 
 
 # --- places and small motions -----------------------------------------------------------------------------------------
@@ -243,6 +243,7 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, specimen
     assert any("read in in" in str(remark) for remark in found.remarks)
 
 
+@pytest.mark.long
 def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, in_place, monkeypatch):
     probe, rng = without_base(jaw.mesh), np.random.default_rng(0)
     put(tmp_path, "reference/m.ply", probe)

@@ -33,6 +33,7 @@ from cuspid.storage import MM_PER_UNIT, MeasuredFile, Unit
 from cuspid.storage.files import read_arrays, write_arrays
 from cuspid.studies.scanners.files import area_file, beside, body_file, landmark_file
 from cuspid.values import LONGEST_MM, number
+from cuspid.workers import computed_once
 
 PLACES = 60_000
 """Number of places on a reference."""
@@ -87,6 +88,36 @@ class Specimen:
     arch: Arch | None
     notes: tuple[str, ...]
 
+    @computed_once
+    def width_mm(self) -> float:
+        """The largest extent of the reference."""
+        return MeasuredFile(path=Path(self.name), mesh=self.mesh, unit="mm").width_mm
+
+    @computed_once
+    def reference_surface(self) -> SignedDistance:
+        """Distances to the reference."""
+        return SignedDistance(self.mesh)
+
+    @computed_once
+    def area_surface(self) -> SignedDistance:
+        """Distances to the reference area."""
+        return SignedDistance(self.mesh.submesh(self.area_faces))
+
+    @computed_once
+    def crown_surface(self) -> SignedDistance:
+        """Distances to the crowns."""
+        return SignedDistance(self.mesh.submesh(self.crown_faces))
+
+    @computed_once
+    def body_surface(self) -> SignedDistance | None:
+        """Distances to the library's scan body."""
+        return None if self.body is None else SignedDistance(self.body)
+
+    @computed_once
+    def place_tree(self) -> KDTree:
+        """Of the places."""
+        return KDTree(self.places.points)
+
     @property
     def arch_curve(self) -> ArchCurve | None:
         """The line along the crowns."""
@@ -111,10 +142,10 @@ class Specimen:
         return tuple(piece for piece in order if piece in there)
 
 
-def guessed_unit(path: Path, like_mm: float | None = None) -> tuple[Unit, str | None]:
-    """The unit of a mesh file by its size, which is that of teeth or jaws, or nearly ``like_mm`` where that is known;
-    and what is odd about it. Raises InputError where no unit fits."""
-    file = MeasuredFile(path=path, mesh=storage.read_mesh(path), unit="mm")
+def guessed_unit(path: Path, mesh: Mesh, like_mm: float | None = None) -> tuple[Unit, str | None]:
+    """The unit of a file whose mesh was read in mm, by its size, which is that of teeth or jaws, or nearly ``like_mm``
+    where that is known; and what is odd about it. Raises InputError where no unit fits."""
+    file = MeasuredFile(path=path, mesh=mesh, unit="mm")
     low, high = _SIZES_MM if like_mm is None else (like_mm / 3, like_mm * 3)
     if low <= file.width_mm <= high:
         return "mm", None
@@ -140,7 +171,7 @@ def load_specimen(
     align_teeth: tuple[int, ...] = (),
 ) -> Specimen:
     """The reference of a specimen and what lies beside it. Raises InputError where it cannot be used."""
-    read_in, odd = (unit, None) if unit is not None else guessed_unit(path)
+    read_in, odd = (unit, None) if unit is not None else guessed_unit(path, storage.read_mesh(path))
     jaw, occlusal_from_file, notes = _load_reference(path, read_in, arch, labelling)
     mesh, mm = jaw.mesh, MM_PER_UNIT[read_in]
     area = _area_of(path, jaw, occlusal_from_file, read_in, align_teeth)
@@ -306,8 +337,9 @@ def _bodies_of(
     table, library = beside(path, [".bodies.csv"]), body_file(path)
     if table is None or library is None:
         return None, {}, ()
-    unit, _ = guessed_unit(library, like_mm=8.0)
-    body, _ = facing_outwards(storage.read_mesh(library, unit))
+    read = storage.read_mesh(library)
+    unit, _ = guessed_unit(library, read, like_mm=8.0)
+    body, _ = facing_outwards(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     surface = SignedDistance(body)
     found, notes = {}, []
     for row in storage.read_table(table, ("label", "x", "y", "z")):
