@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cuspid import storage
+from cuspid.arch_curve import ArchCurve
 from cuspid.errors import InputError
 from cuspid.evaluation.alignments import align_points
+from cuspid.evaluation.deformation import bend, straighten
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import best_motion, deviations_um, scatter
 from cuspid.evaluation.registration import RegistrationOptions
@@ -193,6 +195,18 @@ def test_points_are_aligned_without_scale_and_a_line_is_refused():
         align_points(line, line, "spheres")
 
 
+@given(spread=st.floats(-300, 300), twist=st.floats(-300, 300), ppm=st.floats(-500, 500))
+@settings(max_examples=10, deadline=None)
+def test_a_bend_is_taken_back(spread, twist, ppm):
+    angle = np.linspace(np.pi, 0, 200)
+    curve = ArchCurve(points=np.stack([25 * np.cos(angle), 30 * np.sin(angle), 0 * angle], axis=1))
+    told = {"scale": ppm, "spread": spread, "lift": 50.0, "twist": twist}
+    points = curve.points[::7] + np.array([1.0, -2.0, -3.0])
+    bent = bend(curve, told, points)
+    assert np.abs(straighten(curve, told, bent) - points).max() < 1e-5
+    assert 0.005 < np.abs(bent - points).max() < 1
+
+
 # --- a whole study ----------------------------------------------------------------------------------------------------
 
 
@@ -206,6 +220,13 @@ def in_place(monkeypatch):
         return ()
 
     monkeypatch.setattr("cuspid.studies.scanners.study.run_grid", done)
+
+
+def specimen_bent(cases, specimen, told):
+    """The middles of the pieces where the bends of a scan move them."""
+    points = specimen.places.points
+    bent = points + sum(cases.bent(points, specimen.curve, mode, um) - points for mode, um in told.items())
+    return [bent[specimen.piece == piece].mean(axis=0) for piece in specimen.pieces]
 
 
 @pytest.mark.long
@@ -236,6 +257,17 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, specimen
     truth = cases.truth_of(upright, bent, {})
     assert rows["bent"]["rms_um"] == pytest.approx(truth.rms_um, rel=0.02, abs=0.5)
     assert 2 < rows["inches"]["mean_abs_um"] < 8
+    at = {
+        specimen.piece_name(piece): specimen.places.points[specimen.piece == piece].mean(axis=0)
+        for piece in specimen.pieces
+    }
+    bent_at = dict(zip(at, specimen_bent(cases, specimen, told), strict=True))
+    spans = [row for row in found.tables.spans if row["scan"] == "bent"]
+    assert len(spans) > 20
+    for row in spans:
+        pair = row["first"], row["second"]
+        true_mm, nominal_mm = (np.linalg.norm(where[pair[0]] - where[pair[1]]) for where in (bent_at, at))
+        assert row["error_um"] == pytest.approx(1000 * (true_mm - nominal_mm), abs=0.5)
     reasons = {remark.what: remark.why for remark in found.remarks if remark.left_out}
     assert "mirror image" in reasons["B/m/mirror"]
     assert "of what the median scan" in reasons["B/m/part"]

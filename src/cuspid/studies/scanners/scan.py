@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from cuspid import storage
 from cuspid.errors import InputError
 from cuspid.evaluation.alignments import AlignmentKind, align_on_area, align_points
-from cuspid.evaluation.deformation import fit_deformation
+from cuspid.evaluation.deformation import Deformation, bend, fit_deformation, straighten
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import deviations_um
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, located, register
@@ -22,8 +22,8 @@ from cuspid.evaluation.spans import Station, angle_between_deg, spans
 from cuspid.evaluation.spheres import SphereOptions, evaluate_spheres
 from cuspid.evaluation.teeth import ScannedTooth, find_teeth
 from cuspid.facing import facing_outwards
-from cuspid.geometry import Rigid3
-from cuspid.jaw import Jaw
+from cuspid.geometry import Rigid3, best_similarity
+from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.options import SEED, SHARE, TOOTH, Options, Range
 from cuspid.storage import MM_PER_UNIT
@@ -106,7 +106,8 @@ def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> M
     against = SignedDistance(aligned)
     sample_um, sample_place, piece = _onto_reference(points, specimen)
     place_um = deviations_um(specimen.places, against, options.farthest_mm)
-    stations = {**_pieces(points, sample_um, piece, specimen, options), **parts}
+    deformation = _deformation(specimen, against, place_um)
+    stations = {**_pieces(points, sample_um, piece, specimen, deformation, options), **parts}
     return Measured(
         place_um=place_um.astype(np.float32),
         sample_um=sample_um.astype(np.float32),
@@ -117,7 +118,7 @@ def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> M
             "overlap": rough.overlap,
             "similarity_scale_ppm": 1e6 * (rough.scale - 1),
             "notes": [*told["notes"], *rough.notes, *missed],
-            "deformation": _deformation(specimen, against, place_um),
+            "deformation": None if deformation is None else asdict(deformation),
             "spans": [asdict(span) for kind, found in _kinds(stations).items() for span in spans(kind, found)],
             "shifts": [_shift(kind, label, station) for (kind, label), station in stations.items()],
         },
@@ -285,25 +286,41 @@ def _pieces(
     sample_um: Float[np.ndarray, "s"],
     piece: Int[np.ndarray, "s"],
     specimen: Specimen,
+    deformation: Deformation | None,
     options: StudyOptions,
 ) -> Parts:
-    """Teeth, or stations along the arch, as rigid parts."""
-    surface, near = specimen.reference_surface, np.abs(sample_um) < 1000 * options.farthest_mm
-    sizes = {each: int(np.sum(specimen.piece == each)) for each in specimen.pieces}
-    centroids = {
-        each: specimen.places.points[specimen.piece == each].mean(axis=0)
-        for each, size in sizes.items()
-        if size >= _LEAST_PIECE
-    }
-    found = find_teeth(points[near], piece[near], centroids, surface, options.registration, order=specimen.pieces)
+    """Teeth, or stations along the arch, as rigid parts of a scan that its modes are taken out of: a bend within a part
+    would shift its rigid fit."""
+    used = (np.abs(sample_um) < 1000 * options.farthest_mm) & (piece != GUM)
+    places = {each: specimen.places.points[specimen.piece == each] for each in specimen.pieces}
+    centroids = {each: at.mean(axis=0) for each, at in places.items() if len(at) >= _LEAST_PIECE}
+    curve = specimen.arch_curve
+    straight = points[used]
+    if curve is not None and deformation is not None:
+        straight = straighten(curve, deformation.amplitudes, straight)
+    found = find_teeth(
+        straight, piece[used], centroids, specimen.reference_surface, options.registration, order=specimen.pieces
+    )
     kind = "teeth" if specimen.labelled else "stations"
-    return {(kind, specimen.piece_name(each)): _as_station(tooth, surface) for each, tooth in found.items()}
+    return {
+        (kind, specimen.piece_name(each)): _as_station(tooth, places[each], specimen, deformation)
+        for each, tooth in found.items()
+    }
 
 
-def _as_station(tooth: ScannedTooth, surface: SignedDistance) -> Station:
-    pose = tooth.reference_from_scan
-    measured = Rigid3(pose.inverse().rotation, located(tooth.points, surface, pose, tooth.centroid))
-    return Station(nominal=Rigid3(np.eye(3), tooth.centroid), measured=measured)
+def _as_station(
+    tooth: ScannedTooth, places: Float[np.ndarray, "n 3"], specimen: Specimen, deformation: Deformation | None
+) -> Station:
+    """Where a part lies in the scan: its own motion first, then what the modes do to it there."""
+    centroid, pose, curve = tooth.centroid, tooth.reference_from_scan, specimen.arch_curve
+    middle = located(tooth.points, specimen.reference_surface, pose, centroid)
+    measured = Rigid3(pose.inverse().rotation, middle)
+    if curve is not None and deformation is not None:
+        moved = middle + measured.rotate(places - centroid)
+        bent = bend(curve, deformation.amplitudes, moved)
+        _, turn, _ = best_similarity(moved, bent)
+        measured = Rigid3(turn @ measured.rotation, bent.mean(axis=0))
+    return Station(nominal=Rigid3(np.eye(3), centroid), measured=measured)
 
 
 def _kinds(stations: Mapping[tuple[str, str], Station]) -> dict[str, dict[str, Station]]:
@@ -334,7 +351,7 @@ def _axis_deg(station: Station) -> float | None:
     return angle_between_deg(station.measured.rotate(axis), station.nominal.rotate(axis))
 
 
-def _deformation(specimen: Specimen, scan: SignedDistance, place_um: Float[np.ndarray, "p"]) -> dict[str, Any] | None:
+def _deformation(specimen: Specimen, scan: SignedDistance, place_um: Float[np.ndarray, "p"]) -> Deformation | None:
     """The modes of the arch, fitted to places on crowns that the scan shows, or on all surface without any."""
     curve = specimen.arch_curve
     if curve is None:
@@ -343,5 +360,4 @@ def _deformation(specimen: Specimen, scan: SignedDistance, place_um: Float[np.nd
     chosen = np.flatnonzero(asked)
     thinned = np.zeros(len(asked), dtype=bool)
     thinned[chosen[:: max(1, len(chosen) // _FITTED_PLACES)]] = True
-    found = fit_deformation(specimen.places.chosen(thinned), curve, scan)
-    return None if found is None else asdict(found)
+    return fit_deformation(specimen.places.chosen(thinned), curve, scan)
