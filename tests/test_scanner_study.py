@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,8 +24,9 @@ from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.studies.scanners.files import find_files, without_repeats
 from cuspid.studies.scanners.scan import StudyOptions
+from cuspid.studies.scanners.soundness import count_cuts, cut_notes, mended
 from cuspid.studies.scanners.specimen import guessed_unit, load_specimen
-from cuspid.studies.scanners.study import Intake, compare, measure_share, prepare
+from cuspid.studies.scanners.study import Intake, compare, foreseen, measure_share, prepare
 from cuspid.studies.scanners.summary import difference_um, region_of
 from horseshoe import horseshoe, without_base
 from verbs import refused, run
@@ -153,6 +155,39 @@ def test_the_unit_of_a_file_is_told_by_its_reference(tmp_path, jaw, per_mm, unit
         guessed_unit(tmp_path / "b.stl", storage.read_mesh(tmp_path / "b.stl"), like_mm=60.0)
 
 
+# --- odd triangles ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_faces_that_are_there_twice_are_used_once(jaw, turned):
+    mesh = without_base(jaw.mesh)
+    again = mesh.faces[:, ::-1] if turned else mesh.faces
+    one, notes = mended(Mesh(mesh.vertices, np.concatenate([mesh.faces, again])))
+    assert notes == ("every face is there twice; one of each is used",)
+    assert one.face_areas.sum() == pytest.approx(mesh.face_areas.sum())
+    assert np.sum(one.face_centres * one.face_normals) == pytest.approx(np.sum(mesh.face_centres * mesh.face_normals))
+    some, notes = mended(Mesh(mesh.vertices, np.concatenate([mesh.faces, again[::3]])))
+    assert len(some.faces) == len(mesh.faces)
+    assert f"{len(again[::3])} of {len(mesh.faces) + len(again[::3])} faces" in notes[0]
+    assert mended(mesh) == (mesh, ())
+
+
+@given(st.integers(1, 4), st.integers(0, 99))
+@settings(max_examples=5, deadline=None)
+def test_places_where_a_surface_cuts_itself_are_counted(posts, seed):
+    """Posts through a sheet: each cuts it around once, and in whatever order its faces are."""
+    sheet = trimesh.creation.box((40, 40, 1)).subdivide_to_size(0.9)
+    parts = [trimesh.creation.cylinder(0.8, 6, sections=24).subdivide_to_size(0.7) for _ in range(posts)]
+    for k, post in enumerate(parts):
+        post.apply_translation([8.03 * k - 12.1, 1.07, 3.2])
+    whole = trimesh.util.concatenate([sheet, *parts])
+    order = np.random.default_rng(seed).permutation(len(whole.faces))
+    mesh = Mesh(np.asarray(whole.vertices), np.asarray(whole.faces)[order])
+    assert count_cuts(mesh) == posts
+    assert count_cuts(Mesh(np.asarray(sheet.vertices), np.asarray(sheet.faces))) == 0
+    assert ("one place" in cut_notes(mesh)[0]) == (posts == 1)
+
+
 # --- places and small motions -----------------------------------------------------------------------------------------
 
 
@@ -246,10 +281,21 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, specimen
     part = probe.submesh(probe.face_centres[:, 0] > np.quantile(probe.face_centres[:, 0], 0.68))
     put(tmp_path, "B/m/part.stl", noisy(part, rng))
     (tmp_path / "B" / "m" / "empty.stl").touch()
+    twofold = noisy(probe, rng)
+    put(tmp_path, "Scan ñ 2/m/two fold é.stl", Mesh(twofold.vertices, np.concatenate([twofold.faces] * 2)))
     out = tmp_path / "out"
-    found = compare(prepare(tmp_path, out, QUICK, Intake()), out, QUICK)
+    prepared = prepare(tmp_path, out, QUICK, Intake())
+    told_before = [str(remark) for remark in foreseen(prepared, out, QUICK)]
+    found = compare(prepared, out, QUICK)
+    assert told_before == [str(remark) for remark in found.remarks]
+    assert "Scan ñ 2/m/two fold é: every face is there twice; one of each is used" in told_before
+    assert "Scan ñ 2: one scan of m alone: its precision cannot be told" in told_before
     rows = {row["scan"]: row for row in found.tables.scans}
-    assert set(rows) == {"bent", "inches"}
+    assert set(rows) == {"bent", "inches", "two fold é"}
+    assert 2 < rows["two fold é"]["mean_abs_um"] < 8
+    groups = {row["scanner"]: row["precision_rms_um"] for row in found.tables.groups}
+    assert groups["Scan ñ 2"] is None
+    assert groups["A"] > 0
     assert rows["bent"]["lift_um"] == pytest.approx(120, rel=0.05)
     assert rows["bent"]["spread_um"] == pytest.approx(-60, rel=0.05)
     assert abs(rows["bent"]["twist_um"]) < 3

@@ -21,7 +21,6 @@ from cuspid.evaluation.scan_bodies import BodyFit, BodyOptions, fit_body
 from cuspid.evaluation.spans import Station, angle_between_deg, spans
 from cuspid.evaluation.spheres import SphereOptions, evaluate_spheres
 from cuspid.evaluation.teeth import ScannedTooth, find_teeth
-from cuspid.facing import facing_outwards
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
@@ -29,6 +28,7 @@ from cuspid.options import SEED, SHARE, TOOTH, Options, Range
 from cuspid.storage import MM_PER_UNIT
 from cuspid.storage.files import write_arrays
 from cuspid.studies.scanners.files import ScanFile
+from cuspid.studies.scanners.soundness import cut_notes, mended
 from cuspid.studies.scanners.specimen import Specimen, guessed_unit, scan_landmarks
 
 Region = Literal["all", "crowns", "area"]
@@ -138,13 +138,13 @@ def write_measured(folder: Path, key: str, measured: Measured, *, made_from: str
 def _read(scan: ScanFile, specimen: Specimen) -> tuple[Mesh, dict[str, Any]]:
     read = storage.read_mesh(scan.path)
     unit, odd = guessed_unit(scan.path, read, like_mm=specimen.width_mm)
-    mesh, facing = facing_outwards(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
+    mesh, mending = mended(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     # From here on in the frame that the reference was turned into: without an alignment both stay together.
     return mesh.transformed(specimen.occlusal_from_file), {
         "unit": unit,
         "faces": len(mesh.faces),
         "area_mm2": float(mesh.face_areas.sum()),
-        "notes": [*([] if odd is None else [odd]), *facing],
+        "notes": [*([] if odd is None else [odd]), *mending, *cut_notes(mesh)],
     }
 
 

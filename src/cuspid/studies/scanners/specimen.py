@@ -32,6 +32,7 @@ from cuspid.mesh import Mesh
 from cuspid.storage import MM_PER_UNIT, MeasuredFile, Unit
 from cuspid.storage.files import read_arrays, write_arrays
 from cuspid.studies.scanners.files import area_file, beside, body_file, landmark_file
+from cuspid.studies.scanners.soundness import cut_notes, first_of_each, mended
 from cuspid.values import LONGEST_MM, number
 from cuspid.workers import computed_once
 
@@ -225,10 +226,13 @@ def _load_reference(
     if storage.is_jaw(path):
         return storage.read_jaw(path), Rigid3.identity(), ()
     mesh, labels, _ = storage.read_labelled_mesh(path, unit)
+    keep, doubled = first_of_each(mesh)
+    if doubled:
+        mesh, labels = mesh.submesh(keep), None if labels is None else labels[keep]
     mesh, facing = facing_outwards(mesh)
     occlusal = find_occlusal_frame(mesh)
     upright = mesh.transformed(occlusal.occlusal_from_mesh)
-    notes = (*facing, *occlusal.notes)
+    notes = (*doubled, *facing, *cut_notes(mesh), *occlusal.notes)
     arch = arch or named_arch(path)
     if labels is not None:
         try:
@@ -339,7 +343,7 @@ def _bodies_of(
         return None, {}, ()
     read = storage.read_mesh(library)
     unit, _ = guessed_unit(library, read, like_mm=8.0)
-    body, _ = facing_outwards(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
+    body, _ = mended(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     surface = SignedDistance(body)
     found, notes = {}, []
     for row in storage.read_table(table, ("label", "x", "y", "z")):
