@@ -27,7 +27,7 @@ from cuspid.studies.scanners.scan import StudyOptions
 from cuspid.studies.scanners.soundness import count_cuts, cut_notes, mended
 from cuspid.studies.scanners.specimen import guessed_unit, load_specimen
 from cuspid.studies.scanners.study import Intake, compare, foreseen, measure_share, prepare
-from cuspid.studies.scanners.summary import difference_um, region_of
+from cuspid.studies.scanners.summary import Group, difference_um, group_row, region_of
 from horseshoe import horseshoe, without_base
 from verbs import refused, run
 
@@ -216,6 +216,19 @@ def test_pairs_at_places_agree_with_pairs_of_meshes(jaw):
     of_meshes = compare_pair(*scans, PairOptions(samples=20_000), rng=rng).deviation.mean_abs_um
     assert at_places == pytest.approx(of_meshes, rel=0.03)
     assert 3 < of_meshes < 40
+
+
+@pytest.mark.parametrize(("bias_um", "noise_um", "scans"), [(6.0, 4.0, 8), (0.0, 5.0, 12)])
+def test_systematic_and_random_parts_are_told_apart(bias_um, noise_um, scans):
+    rng = np.random.default_rng(1)
+    bias = bias_um * rng.normal(size=20_000)
+    fields = bias + noise_um * rng.normal(size=(scans, len(bias)))
+    mean = Group(scanner="s", specimen="m", count=scans, mean_um=fields.mean(axis=0), sd_um=fields.std(axis=0, ddof=1))
+    row = group_row([], mean, [], [{"mean_abs_um": 1.0, "rms_um": 2.0}])
+    assert row["repeatability_sd_um"] == pytest.approx(noise_um, rel=0.02)
+    assert row["repeatability_limit_um"] == pytest.approx(2.8 * row["repeatability_sd_um"])
+    assert 0.9 * noise_um < row["median_sd_um"] < row["repeatability_sd_um"]
+    assert row["systematic_rms_um"] == pytest.approx(bias_um, rel=0.03, abs=0.3)
 
 
 def test_points_are_aligned_without_scale_and_a_line_is_refused():

@@ -20,7 +20,7 @@ from cuspid.anatomy.surfaces import SURFACES
 from cuspid.errors import InputError
 from cuspid.evaluation.deviation import statistics
 from cuspid.evaluation.places import Places, SmallMotion, best_motion
-from cuspid.evaluation.repeatability import PairOptions, compare_pair
+from cuspid.evaluation.repeatability import LIMIT_FACTOR, PairOptions, compare_pair
 from cuspid.geometry import Rigid3
 from cuspid.mesh import Mesh
 from cuspid.progress import Progress, silent
@@ -396,7 +396,8 @@ def group_row(group: Sequence[Compared], found: Group, pairs: Sequence[Row], sca
         "precision_mean_abs_um": float(np.mean([row["mean_abs_um"] for row in pairs])) if pairs else None,
         "precision_rms_um": float(np.mean([row["rms_um"] for row in pairs])) if pairs else None,
         "repeatability_sd_um": None if random is None else float(np.sqrt(random)),
-        "repeatability_limit_um": None if random is None else float(2.8 * np.sqrt(random)),
+        "median_sd_um": None if random is None else float(np.median(sd)),
+        "repeatability_limit_um": None if random is None else float(LIMIT_FACTOR * np.sqrt(random)),
         "systematic_rms_um": None
         if random is None
         else float(np.sqrt(max(0.0, float(np.mean(mean**2)) - random / found.count))),
