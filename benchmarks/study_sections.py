@@ -154,7 +154,8 @@ def _speed(found: Result) -> str:
     minutes = found["cpu_s"] / 60 * SCANS / found["scans"] / found["cores"]
     return (
         f"{found['scans']} scans of {found['faces']:,} faces took {found['wall_s']:.0f} s and {found['cpu_s']:.0f} s "
-        f"of CPU on {found['cores']} cores (load {found['load']:.1f}), the largest process "
-        f"{mark(found['largest_process_gib'], GIB)} GiB. In proportion, without other work, {SCANS} scans would take "
+        f"of CPU on {found['cores']} cores (load {found['load']:.1f}), and at most "
+        f"{mark(found['all_processes_gib'], GIB)} GiB in all processes together (bar {GIB:g} GiB). In "
+        f"proportion, without other work, {SCANS} scans would take "
         f"{mark(minutes, MINUTES)} min (bar {MINUTES:g}; an estimate, not measured)."
     )

@@ -9,28 +9,19 @@ from hypothesis import strategies as st
 
 from cuspid import storage
 from cuspid.evaluation.deviation import EvaluationOptions
+from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions
-from cuspid.evaluation.repeatability import PairOptions, compare_pair, spread
+from cuspid.evaluation.repeatability import PairOptions, compare_pair
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
 from cuspid.model.mesh import Mesh
 from cuspid.pipeline.scan import SimulationOptions
-from cuspid.report.figures.repeat import save_repeat_picture
-from cuspid.report.pages.report import report_page
 from cuspid.runtime.errors import InputError
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.studies.design_comparison import with_smaller_images
 from cuspid.studies.grid import Outcome
-from cuspid.studies.repetition import (
-    RepeatOptions,
-    Repetition,
-    compare_scans,
-    figures_spread,
-    pair_cases,
-    scan_again,
-    scan_cases,
-    shoot_again,
-)
+from cuspid.studies.repetition import MANIFEST, RepeatOptions, list_scans, scan_again, scan_cases, shoot_again
+from cuspid.studies.scanners.files import find_files
 from cuspid.studies.trial import TrialOptions
 from verbs import refused
 
@@ -96,46 +87,6 @@ def test_what_one_scan_alone_shows_does_not_count():
         compare_pair(mesh, away, IN_PLACE, rng=np.random.default_rng(0))
 
 
-def test_systematic_and_random_parts_are_told_apart():
-    mesh, rng = dome(), np.random.default_rng(1)
-    bias_um, noise_um, scans = 6.0, 4.0, 8
-    systematic = bias_um * waves(mesh, rng)
-    made = [lifted(mesh, systematic + noise_um * waves(mesh, rng)) for _ in range(scans)]
-    found = spread(mesh, np.ones(len(mesh.faces), dtype=bool), made, PAIRS, rng=rng)
-    assert found.repeatability_sd_um == pytest.approx(noise_um, rel=0.15)
-    assert found.bias_rms_um == pytest.approx(np.sqrt(np.mean(systematic**2)), rel=0.15)
-    assert found.repeatability_limit_um == pytest.approx(2.8 * found.repeatability_sd_um)
-    assert found.common_pct > 97
-    assert 0.5 * noise_um < found.median_sd_um < found.repeatability_sd_um
-    assert np.nanmax(np.abs(found.mean_um)) < 3 * (bias_um + noise_um)
-
-
-def test_noise_alone_has_hardly_a_systematic_part():
-    mesh, rng = dome(), np.random.default_rng(2)
-    made = [lifted(mesh, 5 * waves(mesh, rng)) for _ in range(12)]
-    found = spread(mesh, np.ones(len(mesh.faces), dtype=bool), made, PAIRS, rng=rng)
-    assert found.bias_rms_um < 1.5 < 4 < found.repeatability_sd_um < 6
-
-
-def test_a_spread_needs_two_scans_and_a_common_place():
-    mesh, rng = dome(), np.random.default_rng(0)
-    asked = np.ones(len(mesh.faces), dtype=bool)
-    with pytest.raises(InputError, match="at least two"):
-        spread(mesh, asked, [mesh], PAIRS, rng=rng)
-    sides = [mesh.submesh(sign * mesh.face_centres[:, 0] > 1) for sign in (1, -1)]
-    with pytest.raises(InputError, match="no point of the reference"):
-        spread(mesh, asked, sides, PAIRS, rng=rng)
-    with pytest.raises(InputError, match="no face of the reference"):
-        spread(mesh, ~asked, [mesh, mesh], PAIRS, rng=rng)
-
-
-def test_the_spread_of_figures():
-    rows = [{"a": 1.0}, {"a": 3.0}]
-    assert figures_spread(rows, ("a",)) == {"a": {"mean": 2.0, "sd": pytest.approx(np.sqrt(2)), "min": 1.0, "max": 3.0}}
-    assert figures_spread(rows[:1], ("a",))["a"]["sd"] is None
-    assert figures_spread([], ("a",)) == {}
-
-
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
@@ -160,70 +111,33 @@ def test_hand_and_noise_differ_but_the_object_stays(tmp_path, coarse_phantom, ne
 
 
 @pytest.mark.long
-def test_two_scans_to_a_report(tmp_path, coarse_phantom):
-    """Each step of the study as its grids call it."""
-    options = RepeatOptions(scans=2, pair_samples=5000)
-    trial = small_trial()
-    storage.write_jaw(tmp_path / "reference.ply", coarse_phantom)
+def test_two_scans_are_compared_as_those_of_any_scanner(tmp_path, coarse_phantom):
+    """Each step as its grid calls it, and what is listed for the study."""
+    options, trial = RepeatOptions(scans=2), small_trial()
+    storage.write_jaw(tmp_path / "jaw.ply", coarse_phantom)
     storage.write_handpiece(tmp_path / "handpiece.json", with_smaller_images(DESIGNS["four"](DesignOptions()), 0.4))
     scans = tuple(
         Outcome(case=case, figures=scan_again(**case.parameters, folder=tmp_path, options=options, trial=trial))
         for case in scan_cases(options, trial)
     )
-    [case] = pair_cases([outcome.case.name for outcome in scans])
-    pair = Outcome(case=case, figures=compare_scans(**case.parameters, folder=tmp_path, options=options))
     assert scans[0].figures["mean_abs_um"] != scans[1].figures["mean_abs_um"]
-    assert 0.5 < pair.figures["mean_abs_um"] < 30
-    assert not [path for path in (tmp_path / "scans").iterdir() if path.is_dir()], "images and depth maps are gone"
-    summary = Repetition(scans=scans, pairs=(pair,), spread=None).summary
-    assert summary["precision"]["mean_abs_um"]["mean"] == pair.figures["mean_abs_um"]
+    assert not list((tmp_path / "scratch").iterdir()), "images and depth maps are gone"
+    list_scans(coarse_phantom, scans, tmp_path)
+    found = find_files(tmp_path / MANIFEST)
+    assert [(scan.scan, scan.path.exists()) for scan in found.scans] == [("scan-0", True), ("scan-1", True)]
+    reference, scan = storage.read_jaw(found.references["jaw"]), storage.read_mesh(found.scans[0].path)
+    assert 46 in reference.teeth
+    assert len(reference.mesh.faces) < 0.5 * len(coarse_phantom.mesh.faces)
+    assert np.abs(reference.mesh.bounds - scan.bounds).max() < 3
+    assert np.mean(np.abs(SignedDistance(reference.mesh).closest_points(scan.vertices).signed_mm)) < 0.03
 
 
-def test_the_report_of_repeated_scans(tmp_path):
-    mesh, rng = dome(), np.random.default_rng(3)
-    found = spread(
-        mesh,
-        np.ones(len(mesh.faces), dtype=bool),
-        [lifted(mesh, 3 * waves(mesh, rng)) for _ in range(3)],
-        PAIRS,
-        rng=rng,
-    )
-    figures = {"mean": 1.0, "sd": 0.5, "min": 0.5, "max": 2.0}
-    pair = {
-        "first": "scan-0",
-        "second": "scan-1",
-        "mean_abs_um": 4.0,
-        "rms_um": 5.0,
-        "p95_um": 6.0,
-        "signed_mean_um": 0.1,
-    }
-    storage.claim_folder(tmp_path, "repeat", {"trial": {"seed": 0}}, {})
-    values = {"mean_deviation_um": found.mean_um, "sd_um": found.sd_um}
-    storage.write_mesh(tmp_path / "repeat.ply", mesh, values=values)
-    storage.write_table(tmp_path / "results.csv", [{"case": "scan-0", "seed": 0, "mean_abs_um": 1.5, "failure": None}])
-    storage.write_json(
-        tmp_path / "repeat.json",
-        {
-            "scans": 2,
-            "trueness": {"mean_abs_um": figures},
-            "precision": {"mean_abs_um": figures},
-            "spread": {
-                "repeatability_sd_um": found.repeatability_sd_um,
-                "median_sd_um": found.median_sd_um,
-                "bias_rms_um": found.bias_rms_um,
-            },
-            "pairs": [pair],
-            "failures": {},
-        },
-    )
-    trueness = {"scan-0": 1.5, "scan-1": 2.5}
-    save_repeat_picture(
-        tmp_path / "repeat.png", mesh, found.mean_um, found.sd_um, trueness, {("scan-0", "scan-1"): 4.0}
-    )
-    page = report_page(storage.read_result(tmp_path))
-    assert f"{found.repeatability_sd_um:.2f}" in page
-    assert "scan-0 – scan-1" in page
-    assert (tmp_path / "repeat.png").stat().st_size > 10_000
+def test_one_scan_that_succeeded_is_no_study(tmp_path, coarse_phantom):
+    cases = scan_cases(RepeatOptions(scans=2), small_trial())
+    scans = (Outcome(case=cases[0], figures={}), Outcome(case=cases[1], figures={}, failure="too dark"))
+    with pytest.raises(InputError, match=r"1 of 2 scans succeeded; at least two are needed \(too dark\)"):
+        list_scans(coarse_phantom, scans, tmp_path)
+    assert not (tmp_path / MANIFEST).exists()
 
 
 def test_bad_input_of_repeat(tmp_path, capsys, phantom_file):
@@ -234,7 +148,7 @@ def test_bad_input_of_repeat(tmp_path, capsys, phantom_file):
         (["--tooth", "46", "--jitter-mm", "-1"], "--jitter-mm"),
         (["--tooth", "46", "--supersampling", "0"], "--supersampling is 0"),
         (["--tooth", "46", "--seed", "-1"], "--seed is -1"),
-        (["--tooth", "46", "--scans", "3", "--farthest-mm", "0"], "--farthest-mm"),
+        (["--tooth", "46", "--scans", "3", "--study.farthest-mm", "0"], "--farthest-mm is 0"),
     ):
         assert message in refused(capsys, "study", "repeat", phantom_file, *arguments, "--out", tmp_path / "out")
         assert not (tmp_path / "out").exists()

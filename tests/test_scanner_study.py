@@ -6,24 +6,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cuspid import storage
 from cuspid.evaluation.alignments import align_points
+from cuspid.evaluation.deformation import bend, straighten
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import best_motion, deviations_um, scatter
 from cuspid.evaluation.registration import RegistrationOptions
 from cuspid.evaluation.repeatability import PairOptions, compare_pair
 from cuspid.evaluation.search import SearchOptions
 from cuspid.geometry import Rigid3
+from cuspid.model.arch_curve import ArchCurve
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
 from cuspid.studies.scanners.files import find_files, without_repeats
 from cuspid.studies.scanners.scan import StudyOptions
+from cuspid.studies.scanners.soundness import count_cuts, cut_notes, mended
 from cuspid.studies.scanners.specimen import guessed_unit, load_specimen
-from cuspid.studies.scanners.study import Intake, compare, measure_share, prepare
-from cuspid.studies.scanners.summary import difference_um, region_of
+from cuspid.studies.scanners.study import Intake, compare, foreseen, measure_share, prepare
+from cuspid.studies.scanners.summary import Group, difference_um, group_row, region_of
 from horseshoe import horseshoe, without_base
 from verbs import refused, run
 
@@ -143,12 +147,45 @@ def test_the_same_file_twice_counts_once(tmp_path):
 @pytest.mark.parametrize(("per_mm", "unit"), [(1.0, "mm"), (0.1, "cm"), (0.001, "m"), (1 / 25.4, "in"), (1000.0, "um")])
 def test_the_unit_of_a_file_is_told_by_its_reference(tmp_path, jaw, per_mm, unit):
     put(tmp_path, "a.stl", Mesh(jaw.mesh.vertices * per_mm, jaw.mesh.faces))
-    found, odd = guessed_unit(tmp_path / "a.stl", like_mm=60.0)
+    found, odd = guessed_unit(tmp_path / "a.stl", storage.read_mesh(tmp_path / "a.stl"), like_mm=60.0)
     assert found == unit
     assert (odd is None) == (unit == "mm")
     put(tmp_path, "b.stl", Mesh(jaw.mesh.vertices * 25.4, jaw.mesh.faces))
     with pytest.raises(InputError, match="no size of teeth or jaws"):
-        guessed_unit(tmp_path / "b.stl", like_mm=60.0)
+        guessed_unit(tmp_path / "b.stl", storage.read_mesh(tmp_path / "b.stl"), like_mm=60.0)
+
+
+# --- odd triangles ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_faces_that_are_there_twice_are_used_once(jaw, turned):
+    mesh = without_base(jaw.mesh)
+    again = mesh.faces[:, ::-1] if turned else mesh.faces
+    one, notes = mended(Mesh(mesh.vertices, np.concatenate([mesh.faces, again])))
+    assert notes == ("every face is there twice; one of each is used",)
+    assert one.face_areas.sum() == pytest.approx(mesh.face_areas.sum())
+    assert np.sum(one.face_centres * one.face_normals) == pytest.approx(np.sum(mesh.face_centres * mesh.face_normals))
+    some, notes = mended(Mesh(mesh.vertices, np.concatenate([mesh.faces, again[::3]])))
+    assert len(some.faces) == len(mesh.faces)
+    assert f"{len(again[::3])} of {len(mesh.faces) + len(again[::3])} faces" in notes[0]
+    assert mended(mesh) == (mesh, ())
+
+
+@given(st.integers(1, 4), st.integers(0, 99))
+@settings(max_examples=5, deadline=None)
+def test_places_where_a_surface_cuts_itself_are_counted(posts, seed):
+    """Posts through a sheet: each cuts it around once, and in whatever order its faces are."""
+    sheet = trimesh.creation.box((40, 40, 1)).subdivide_to_size(0.9)
+    parts = [trimesh.creation.cylinder(0.8, 6, sections=24).subdivide_to_size(0.7) for _ in range(posts)]
+    for k, post in enumerate(parts):
+        post.apply_translation([8.03 * k - 12.1, 1.07, 3.2])
+    whole = trimesh.util.concatenate([sheet, *parts])
+    order = np.random.default_rng(seed).permutation(len(whole.faces))
+    mesh = Mesh(np.asarray(whole.vertices), np.asarray(whole.faces)[order])
+    assert count_cuts(mesh) == posts
+    assert count_cuts(Mesh(np.asarray(sheet.vertices), np.asarray(sheet.faces))) == 0
+    assert ("one place" in cut_notes(mesh)[0]) == (posts == 1)
 
 
 # --- places and small motions -----------------------------------------------------------------------------------------
@@ -181,6 +218,19 @@ def test_pairs_at_places_agree_with_pairs_of_meshes(jaw):
     assert 3 < of_meshes < 40
 
 
+@pytest.mark.parametrize(("bias_um", "noise_um", "scans"), [(6.0, 4.0, 8), (0.0, 5.0, 12)])
+def test_systematic_and_random_parts_are_told_apart(bias_um, noise_um, scans):
+    rng = np.random.default_rng(1)
+    bias = bias_um * rng.normal(size=20_000)
+    fields = bias + noise_um * rng.normal(size=(scans, len(bias)))
+    mean = Group(scanner="s", specimen="m", count=scans, mean_um=fields.mean(axis=0), sd_um=fields.std(axis=0, ddof=1))
+    row = group_row([], mean, [], [{"mean_abs_um": 1.0, "rms_um": 2.0}])
+    assert row["repeatability_sd_um"] == pytest.approx(noise_um, rel=0.02)
+    assert row["repeatability_limit_um"] == pytest.approx(2.8 * row["repeatability_sd_um"])
+    assert 0.9 * noise_um < row["median_sd_um"] < row["repeatability_sd_um"]
+    assert row["systematic_rms_um"] == pytest.approx(bias_um, rel=0.03, abs=0.3)
+
+
 def test_points_are_aligned_without_scale_and_a_line_is_refused():
     rng = np.random.default_rng(0)
     nominal = {str(k): rng.normal(0, 20, 3) for k in range(5)}
@@ -191,6 +241,18 @@ def test_points_are_aligned_without_scale_and_a_line_is_refused():
     line = {str(k): np.array([float(k), 0.0, 0.0]) for k in range(4)}
     with pytest.raises(InputError, match="on one line"):
         align_points(line, line, "spheres")
+
+
+@given(spread=st.floats(-300, 300), twist=st.floats(-300, 300), ppm=st.floats(-500, 500))
+@settings(max_examples=10, deadline=None)
+def test_a_bend_is_taken_back(spread, twist, ppm):
+    angle = np.linspace(np.pi, 0, 200)
+    curve = ArchCurve(points=np.stack([25 * np.cos(angle), 30 * np.sin(angle), 0 * angle], axis=1))
+    told = {"scale": ppm, "spread": spread, "lift": 50.0, "twist": twist}
+    points = curve.points[::7] + np.array([1.0, -2.0, -3.0])
+    bent = bend(curve, told, points)
+    assert np.abs(straighten(curve, told, bent) - points).max() < 1e-5
+    assert 0.005 < np.abs(bent - points).max() < 1
 
 
 # --- a whole study ----------------------------------------------------------------------------------------------------
@@ -206,6 +268,13 @@ def in_place(monkeypatch):
         return ()
 
     monkeypatch.setattr("cuspid.studies.scanners.study.run_grid", done)
+
+
+def specimen_bent(cases, specimen, told):
+    """The middles of the pieces where the bends of a scan move them."""
+    points = specimen.places.points
+    bent = points + sum(cases.bent(points, specimen.curve, mode, um) - points for mode, um in told.items())
+    return [bent[specimen.piece == piece].mean(axis=0) for piece in specimen.pieces]
 
 
 @pytest.mark.long
@@ -225,10 +294,21 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, specimen
     part = probe.submesh(probe.face_centres[:, 0] > np.quantile(probe.face_centres[:, 0], 0.68))
     put(tmp_path, "B/m/part.stl", noisy(part, rng))
     (tmp_path / "B" / "m" / "empty.stl").touch()
+    twofold = noisy(probe, rng)
+    put(tmp_path, "Scan ñ 2/m/two fold é.stl", Mesh(twofold.vertices, np.concatenate([twofold.faces] * 2)))
     out = tmp_path / "out"
-    found = compare(prepare(tmp_path, out, QUICK, Intake()), out, QUICK)
+    prepared = prepare(tmp_path, out, QUICK, Intake())
+    told_before = [str(remark) for remark in foreseen(prepared, out, QUICK)]
+    found = compare(prepared, out, QUICK)
+    assert told_before == [str(remark) for remark in found.remarks]
+    assert "Scan ñ 2/m/two fold é: every face is there twice; one of each is used" in told_before
+    assert "Scan ñ 2: one scan of m alone: its precision cannot be told" in told_before
     rows = {row["scan"]: row for row in found.tables.scans}
-    assert set(rows) == {"bent", "inches"}
+    assert set(rows) == {"bent", "inches", "two fold é"}
+    assert 2 < rows["two fold é"]["mean_abs_um"] < 8
+    groups = {row["scanner"]: row["precision_rms_um"] for row in found.tables.groups}
+    assert groups["Scan ñ 2"] is None
+    assert groups["A"] > 0
     assert rows["bent"]["lift_um"] == pytest.approx(120, rel=0.05)
     assert rows["bent"]["spread_um"] == pytest.approx(-60, rel=0.05)
     assert abs(rows["bent"]["twist_um"]) < 3
@@ -236,6 +316,17 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, specimen
     truth = cases.truth_of(upright, bent, {})
     assert rows["bent"]["rms_um"] == pytest.approx(truth.rms_um, rel=0.02, abs=0.5)
     assert 2 < rows["inches"]["mean_abs_um"] < 8
+    at = {
+        specimen.piece_name(piece): specimen.places.points[specimen.piece == piece].mean(axis=0)
+        for piece in specimen.pieces
+    }
+    bent_at = dict(zip(at, specimen_bent(cases, specimen, told), strict=True))
+    spans = [row for row in found.tables.spans if row["scan"] == "bent"]
+    assert len(spans) > 20
+    for row in spans:
+        pair = row["first"], row["second"]
+        true_mm, nominal_mm = (np.linalg.norm(where[pair[0]] - where[pair[1]]) for where in (bent_at, at))
+        assert row["error_um"] == pytest.approx(1000 * (true_mm - nominal_mm), abs=0.5)
     reasons = {remark.what: remark.why for remark in found.remarks if remark.left_out}
     assert "mirror image" in reasons["B/m/mirror"]
     assert "of what the median scan" in reasons["B/m/part"]
@@ -243,6 +334,7 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, specimen
     assert any("read in in" in str(remark) for remark in found.remarks)
 
 
+@pytest.mark.long
 def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, in_place, monkeypatch):
     probe, rng = without_base(jaw.mesh), np.random.default_rng(0)
     put(tmp_path, "reference/m.ply", probe)

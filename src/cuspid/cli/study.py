@@ -84,7 +84,7 @@ def study(
         retry_failed: Measure scans that failed before once more.
     """
     check_workers(workers, "study")
-    _require_packages()
+    require_packages("study")
     settings = {"study": options, "references": references, "given": folder.name, "plan_um": plan_um}
     # What is measured again follows from the contents of the files, scan by scan.
     with storage.claimed_folder(out, "study", settings, {}, replace=True):
@@ -104,19 +104,20 @@ def study(
             _print_remarks(foreseen(prepared, out, options))
             _print_plan(prepared)
             return
-        _print_remarks(found.remarks)
-        _save(out, found, options, plan_um)
+        save_study(out, found, options, plan_um)
     report(out)
 
 
-def _require_packages() -> None:
-    """Before hours of work, not after them."""
+def require_packages(verb: str) -> None:
+    """Raise MissingDependencyError before hours of work, not after them."""
     for package, what in _NEEDED.items():
         if find_spec(package) is None:
-            raise MissingDependencyError(f"study: {what} need {package}: pip install 'cuspid[study]'")
+            raise MissingDependencyError(f"{verb}: {what} need {package}: pip install 'cuspid[study]'")
 
 
-def _save(out: Path, found: Study, options: StudyOptions, plan_um: float | None) -> None:
+def save_study(out: Path, found: Study, options: StudyOptions, plan_um: float | None = None) -> None:
+    """Write and print what a study found."""
+    _print_remarks(found.remarks)
     tables = asdict_of(found)
     for name, rows in tables.items():
         if rows:

@@ -16,7 +16,6 @@ from jaxtyping import Float
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.registration import RegistrationOptions, refine
 from cuspid.geometry import Rigid3, best_similarity
-from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
 
 AlignmentKind = Literal["best-fit", "area", "crowns", "landmarks", "spheres", "bodies", "none"]
@@ -43,13 +42,12 @@ _LEAST_SAMPLES = 200
 
 
 def align_on_area(
-    points: Float[np.ndarray, "n 3"], area: Mesh, reference_from_scan: Rigid3, options: RegistrationOptions
+    points: Float[np.ndarray, "n 3"], surface: SignedDistance, reference_from_scan: Rigid3, options: RegistrationOptions
 ) -> Rigid3:
     """Fit a scan to a part of its reference, from an alignment of the whole that is good to about a millimetre.
 
-    ``points`` are samples of the scan. Raises InputError where it hardly shows the area.
+    ``points`` are samples of the scan, ``surface`` is that of the area. Raises InputError where they hardly show it.
     """
-    surface = SignedDistance(area)
     near = np.abs(surface.closest_points(reference_from_scan.apply(points)).signed_mm) < _REACH_MM
     if near.sum() < _LEAST_SAMPLES:
         raise InputError(f"alignment: the scan hardly shows the reference area ({near.sum()} of {len(points)} samples)")

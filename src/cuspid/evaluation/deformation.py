@@ -38,6 +38,7 @@ BESIDE_MM = 12.0
 """Places farther beside the curve have no part in the fit: a palate or a base says little of the arch."""
 _ROUNDS, _SETTLED_UM = 20, 0.01
 _LEAST_PLACES = 300
+_STRAIGHTENINGS = 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,6 +75,25 @@ def mode_fields(curve: ArchCurve, points: Float[np.ndarray, "n 3"]) -> dict[str,
         field = moves[nearest] + np.cross(turn[nearest], points - line[nearest])
         fields[name] = sign * 1e-3 / at_ends * field
     return fields
+
+
+def bend(
+    curve: ArchCurve, amplitudes: Mapping[str, float], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Where modes of some amplitudes move points (mm) of the reference."""
+    fields = mode_fields(curve, points)
+    return np.asarray(points + sum(amplitude * fields[name] for name, amplitude in amplitudes.items()))
+
+
+def straighten(
+    curve: ArchCurve, amplitudes: Mapping[str, float], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Where points were before modes moved them: the inverse of :func:`bend`, by iteration on a contraction, as the
+    modes turn by some mrad at most."""
+    before = points
+    for _ in range(_STRAIGHTENINGS):
+        before = before + points - bend(curve, amplitudes, before)
+    return before
 
 
 def fit_deformation(places: Places, curve: ArchCurve, scan: SignedDistance) -> Deformation | None:

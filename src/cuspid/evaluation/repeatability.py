@@ -15,12 +15,11 @@ results lie to one another; here under repeatability conditions (the same object
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from cuspid.evaluation.deviation import statistics
 from cuspid.evaluation.distance import SignedDistance
@@ -59,31 +58,6 @@ class PairDeviation:
     """Share of their surfaces that both scans show."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Spread:
-    """Deviations of several scans from the reference, in um."""
-
-    mean_um: Float[np.ndarray, "v"]
-    """Mean over the scans, around each vertex of the reference; NaN where not all of them have surface."""
-    sd_um: Float[np.ndarray, "v"]
-    """Sample standard deviation over the scans (n - 1), likewise."""
-    scans: int
-    """Number of scans."""
-    repeatability_sd_um: float
-    """s_r: root mean square of the standard deviation over the surface."""
-    median_sd_um: float
-    """Standard deviation at the median place; unlike s_r, it is hardly affected by a few rough places."""
-    bias_rms_um: float
-    """Root mean square of the systematic part over the surface; 0 where it is lost in the random one."""
-    common_pct: float
-    """Share of the given surface that all scans have."""
-
-    @property
-    def repeatability_limit_um(self) -> float:
-        """2.8 s_r."""
-        return LIMIT_FACTOR * self.repeatability_sd_um
-
-
 def compare_pair(first: Mesh, second: Mesh, options: PairOptions, *, rng: np.random.Generator) -> PairDeviation:
     """Distances between two scans that are already nearly aligned.
 
@@ -109,59 +83,3 @@ def _signed_distances(
     """Signed distances of points of a scan from a surface, and which of them the surface has, too."""
     closest = surface.closest_points(scan.sample(options.samples, rng)[0])
     return closest.signed_mm, ~closest.on_border & (np.abs(closest.signed_mm) <= options.farthest_mm)
-
-
-def spread(
-    reference: Mesh,
-    asked: Bool[np.ndarray, "f"],
-    scans: Sequence[Mesh],
-    options: PairOptions = PairOptions(),
-    *,
-    rng: np.random.Generator,
-) -> Spread:
-    """How the scans deviate from the reference, in whose frame they are, at points on the given faces, uniform by area.
-
-    Raises InputError for fewer than two scans, or where no place is on all of them.
-    """
-    if len(scans) < 2:
-        raise InputError(f"repeatability: only {len(scans)} scan given; at least two are needed")
-    indices = np.flatnonzero(asked)
-    if not len(indices):
-        raise InputError("repeatability: no face of the reference could be seen in all scans")
-    points, picks = Mesh(reference.vertices, reference.faces[indices]).sample(options.samples, rng)
-    faces = indices[picks]
-    normals = reference.face_normals[faces]
-    found = np.stack([_deviations_um(points, normals, scan, options.farthest_mm) for scan in scans])
-    on_all = np.isfinite(found).all(axis=0)
-    if not on_all.any():
-        raise InputError("repeatability: no point of the reference is on all scans; check that they are aligned")
-    means, sds = found[:, on_all].mean(axis=0), found[:, on_all].std(axis=0, ddof=1)
-    random = float(np.mean(sds**2))
-    corners = reference.faces[faces[on_all]]
-    return Spread(
-        mean_um=_at_vertices(means, corners, len(reference.vertices)),
-        sd_um=np.sqrt(_at_vertices(sds**2, corners, len(reference.vertices))),
-        scans=len(scans),
-        repeatability_sd_um=float(np.sqrt(random)),
-        median_sd_um=float(np.median(sds)),
-        bias_rms_um=float(np.sqrt(max(0.0, np.mean(means**2) - random / len(scans)))),
-        common_pct=float(100 * on_all.mean()),
-    )
-
-
-def _deviations_um(
-    places: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], scan: Mesh, farthest_mm: float
-) -> Float[np.ndarray, "n"]:
-    """How far outside each place the scan lies along the normal; NaN where it has no surface near."""
-    outside, inside = scan.cast(places, normals).distances, scan.cast(places, -normals).distances
-    signed_mm = np.where(outside <= inside, outside, -inside)
-    return np.where(np.abs(signed_mm) <= farthest_mm, 1000 * signed_mm, np.nan)
-
-
-def _at_vertices(
-    values: Float[np.ndarray, "n"], corners: Int[np.ndarray, "n 3"], length: int
-) -> Float[np.ndarray, "length"]:
-    """Mean of the values on the faces around each vertex; NaN where there are none."""
-    counts = np.bincount(corners.ravel(), minlength=length)
-    sums = np.bincount(corners.ravel(), np.repeat(values, 3), minlength=length)
-    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)

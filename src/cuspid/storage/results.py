@@ -93,7 +93,7 @@ class ShapeResult(_Result):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StudyResult(_Result):
-    """A folder of ``sweep``, ``compare`` or ``repeat``."""
+    """A folder of ``sweep`` or ``compare``."""
 
     verb: str
     """Which of them."""
@@ -101,10 +101,6 @@ class StudyResult(_Result):
     """What was found: the JSON file with the name of the verb."""
     rows: Sequence[Mapping[str, str]]
     """``results.csv``, or what stands in ``cases/`` so far."""
-    surface: Jaw | None = None
-    """The reference of ``repeat``."""
-    values: Mapping[str, Float[np.ndarray, "v"]] = field(default_factory=dict)
-    """What is known at its vertices: ``mean_deviation_um`` and ``sd_um``."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -310,7 +306,6 @@ _STUDIES: Mapping[str, tuple[str, Mapping[str, str]]] = {
         "comparison.json",
         {"comparison.png": "What each handpiece needs and gives", "surfaces.png": "What each reconstructs, by surface"},
     ),
-    "repeat": ("repeat.json", {"repeat.png": "Where the scans agree with each other and with the reference"}),
 }
 
 
@@ -329,10 +324,7 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
     missing = []
     if summary is None:
         missing.append(f"{file}: {len(rows)} cases are done; run the same command again to continue")
-    surface, values = _read_repeated_surface(folder) if verb == "repeat" else (None, {})
     return StudyResult(
-        surface=surface,
-        values=values,
         name=folder.resolve().name,
         run=run,
         verb=verb,
@@ -341,15 +333,6 @@ def _read_study(folder: Path, run: Mapping[str, Any]) -> StudyResult:
         missing=tuple(missing),
         pictures=_pictures(folder, captions),
     )
-
-
-def _read_repeated_surface(folder: Path) -> tuple[Jaw | None, dict[str, Float[np.ndarray, "v"]]]:
-    """The reference of repeated scans, and what is known at its vertices."""
-    if not (folder / "repeat.ply").exists():
-        return None, {}
-    file = read_mesh_file(folder / "repeat.ply")
-    scanned = _optional_json(folder / "reference.json")
-    return Jaw(mesh=file.mesh, arch=None if scanned is None else scanned["arch"]), dict(file.vertex_values)
 
 
 def _rows(folder: Path) -> list[Mapping[str, str]]:
@@ -387,13 +370,13 @@ def _read_scanner_study(folder: Path, run: Mapping[str, Any]) -> ScannerStudyRes
         run=run,
         summary=summary,
         views=tuple(sorted(views, key=lambda view: view.name)),
-        missing=() if views else ("the 3-D view: run cuspid study scanners again",),
+        missing=() if views else ("the 3-D view: run the same command again",),
         pictures=_pictures(folder / "figures", _STUDY_FIGURES),
     )
 
 
 def _specimen_view(path: Path) -> SpecimenView:
-    arrays = read_arrays(path, remedy="run cuspid study scanners again")
+    arrays = read_arrays(path, remedy="run the same command again")
     about = read_json(path.with_suffix(".json"))
     with reading(path):
         steps = arrays["steps"].astype(np.float64)

@@ -289,6 +289,7 @@ def _groups_table(groups: Sequence[Mapping[str, Any]]) -> Table:
         "precision_mean_abs_um": "precision: mean |d|",
         "precision_rms_um": "RMS",
         "repeatability_sd_um": "s_r",
+        "median_sd_um": "s at the median place",
         "repeatability_limit_um": "limit 2.8 s_r",
         "systematic_rms_um": "systematic, RMS",
     }

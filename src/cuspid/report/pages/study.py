@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from cuspid.model.jaw import Jaw
-from cuspid.model.mesh import Mesh
 from cuspid.model.trueness import METRICS
-from cuspid.report.figures.drawing import fitting_range_um, render
-from cuspid.report.figures.repeat import faces_around
-from cuspid.report.pages.color_scale import deviation_scale
-from cuspid.report.pages.page import jpeg_uri, number, picture_uri, provenance, render_page, script_json, signed
-from cuspid.report.pages.scene import mesh_layer, standard_views
-from cuspid.report.pages.shown_mesh import simplified
+from cuspid.report.pages.page import number, picture_uri, provenance, render_page
 from cuspid.runtime.errors import InputError
 from cuspid.storage import StudyResult
 
@@ -31,13 +20,7 @@ _WORDS = {"std": "SD", "rms": "RMS", "p95": "P95", "um": "µm"}
 _TITLES = {
     "sweep": "Baseline and angle of a pair",
     "compare": "Handpieces compared",
-    "repeat": "Repeated scans: trueness and precision",
 }
-_REPEATED = (
-    "In µm, positive outside the reference: the mean over the scans is systematic, their SD is random. Grey: not in "
-    "all scans."
-)
-"""What the colours tell."""
 _WHEN = ("simulation_s", "reconstruction_s", "reconstruction_cpu_s", "cpu_s")
 
 
@@ -46,7 +29,6 @@ def study_page(result: StudyResult) -> str:
     if not result.rows and result.summary is None:
         raise InputError(f"{result.name}: nothing to report; no case of the study is done yet")
     summary = result.summary or {}
-    view = None if result.surface is None else _view(result.surface, result.values)
     failures = {row["case"]: row["failure"] for row in result.rows if row.get("failure")}
     return render_page(
         "study.html.j2",
@@ -55,45 +37,12 @@ def study_page(result: StudyResult) -> str:
         missing=result.missing,
         lead=_lead(result.verb, summary, len(result.rows), len(failures)),
         tables=_TABLES[result.verb](summary) if summary else [],
-        view=view,
         notes=_notes(result.verb, summary),
         pictures=[(caption, picture_uri(path)) for caption, path in result.pictures.items()],
         all_rows=_all_rows(result.rows),
         failures=failures,
         made=provenance(result.run),
     )
-
-
-def _view(reference: Jaw, values: Mapping[str, Float[np.ndarray, "v"]]) -> dict[str, Any]:
-    """The reference with the mean deviation and with its spread, one at a time."""
-    surface = reference.mesh
-    faces = faces_around(surface, np.isfinite(values["sd_um"]))
-    part, keep = surface.submesh(faces), np.unique(surface.faces[faces])
-    shown = simplified(part, _MOST_FACES)
-    maps = {"mean": ("Mean deviation", "mean_deviation_um"), "sd": ("SD over the scans", "sd_um")}
-    carried = {name: shown.carried(values[column][keep]) for name, (_, column) in maps.items()}
-    layers = [
-        {
-            **mesh_layer(name, label, shown.mesh, visible=name == "mean", values_um={"deviation": carried[name]}),
-            "group": "map",
-        }
-        for name, (label, _) in maps.items()
-    ]
-    size = {"full": shown.full_faces, "shown": len(shown.mesh.faces), "off_um": shown.off_um}
-    range_um = fitting_range_um(float(np.nanpercentile(np.abs(carried["mean"]), 95)))
-    scale = replace(deviation_scale(range_um), label="Colours", meaning=_REPEATED)
-    colored = Mesh(shown.mesh.vertices, shown.mesh.faces, scale.rgb(carried["mean"]))
-    still = render(colored, width_px=900, supersampling=1)
-    views = standard_views(reference.arch)
-    scene = {"layers": layers, "scales": [scale.in_scene]}
-    return {
-        "scene": script_json({**scene, "views": views, "teeth": [], "worst": []}),
-        "still": jpeg_uri(still.image),
-        "toggles": [(layer["name"], layer["label"], layer["visible"]) for layer in layers],
-        "views": [each["name"] for each in views],
-        "shown": [{"name": "scanned part of the reference", **size}],
-        "scales": [scale],
-    }
 
 
 def heading(column: str) -> str:
@@ -130,16 +79,7 @@ def _short(cell: str | None) -> str:
 
 
 def _lead(verb: str, summary: Mapping[str, Any], cases: int, failed: int) -> list[Tile]:
-    tiles: list[Tile] = [("cases" if verb != "repeat" else "scans", str(cases), f"{failed} failed" if failed else "")]
-    if verb == "repeat" and summary.get("precision"):
-        trueness, precision = summary["trueness"], summary["precision"]
-        tiles += [
-            ("trueness: mean |d|, mean of the scans", number(trueness["mean_abs_um"]["mean"], 2), "µm"),
-            ("precision: mean |d|, mean of all pairs", number(precision["mean_abs_um"]["mean"], 2), "µm"),
-            ("repeatability SD at a point", number(summary["spread"]["repeatability_sd_um"], 2), "µm"),
-            ("repeatability SD at the median point", number(summary["spread"]["median_sd_um"], 2), "µm"),
-            ("systematic part at a point, RMS", number(summary["spread"]["bias_rms_um"], 2), "µm"),
-        ]
+    tiles: list[Tile] = [("cases", str(cases), f"{failed} failed" if failed else "")]
     if verb == "sweep" and summary:
         tiles += [("surface", str(summary["surface"]), ""), ("tooth", str(summary["tooth"]), "")]
         tiles += [("the pair lies", str(summary["direction"]), "the arch")]
@@ -222,34 +162,9 @@ def _column(values: Sequence[float | int | None]) -> list[str]:
     return [number(value, 0 if whole else 2) for value in values]
 
 
-def _repeat_tables(summary: Mapping[str, Any]) -> list[Table]:
-    tables = []
-    for name, title, caption in (
-        ("trueness", "Trueness", "Each scan against the reference, in µm, as in the report of a scan."),
-        ("precision", "Precision", "Each pair of scans against each other after rigid alignment, both ways, in µm."),
-    ):
-        if summary.get(name):
-            heads = ["figure", "mean", "SD", "smallest", "largest"]
-            rows = [
-                [heading(figure), *(number(spread[each], 2) for each in ("mean", "sd", "min", "max"))]
-                for figure, spread in summary[name].items()
-            ]
-            tables.append({"title": title, "caption": caption, "heads": heads, "rows": rows})
-    if summary.get("pairs"):
-        rows = [
-            [f"{pair['first']} – {pair['second']}", *(number(pair[each], 2) for each in ("mean_abs_um", "rms_um"))]
-            + [number(pair["p95_um"], 2), signed(pair["signed_mean_um"], 2)]
-            for pair in summary["pairs"]
-        ]
-        heads = ["pair", *(METRICS[name].heading for name in ("mean_abs_um", "rms_um", "p95_um", "signed_mean_um"))]
-        tables.append({"title": "All pairs", "caption": "In µm.", "heads": heads, "rows": rows})
-    return tables
-
-
 _TABLES: Mapping[str, Callable[[Mapping[str, Any]], list[Table]]] = {
     "sweep": _sweep_tables,
     "compare": _compare_tables,
-    "repeat": _repeat_tables,
 }
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from cuspid import storage
 from cuspid.evaluation.alignments import AlignmentKind, align_on_area, align_points
-from cuspid.evaluation.deformation import fit_deformation
+from cuspid.evaluation.deformation import Deformation, bend, fit_deformation, straighten
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import deviations_um
 from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, located, register
@@ -21,15 +20,15 @@ from cuspid.evaluation.scan_bodies import BodyFit, BodyOptions, fit_body
 from cuspid.evaluation.spans import Station, angle_between_deg, spans
 from cuspid.evaluation.spheres import SphereOptions, evaluate_spheres
 from cuspid.evaluation.teeth import ScannedTooth, find_teeth
-from cuspid.geometry import Rigid3
-from cuspid.model.facing import facing_outwards
-from cuspid.model.jaw import Jaw
+from cuspid.geometry import Rigid3, best_similarity
+from cuspid.model.jaw import GUM, Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import SEED, SHARE, TOOTH, Options, Range
-from cuspid.storage import MeasuredFile
+from cuspid.storage import MM_PER_UNIT
 from cuspid.storage.files import write_arrays
 from cuspid.studies.scanners.files import ScanFile
+from cuspid.studies.scanners.soundness import cut_notes, mended
 from cuspid.studies.scanners.specimen import Specimen, guessed_unit, scan_landmarks
 
 Region = Literal["all", "crowns", "area"]
@@ -41,6 +40,10 @@ _FITTED_PLACES = 20_000
 """Of the places, so many tell the modes of the arch."""
 _LEAST_PIECE = 300
 """Places of a tooth or station, at least, that make it one."""
+_FEW_POSES = {"anchors": 4, "targets": 1500, "candidates": 40, "finalists": 2}
+"""Of a search, what suffices mostly: with all real jaws that were tried, and with halves of them."""
+_SURE_OVERLAP = 0.85
+"""An alignment by few poses counts where this share of the smaller surface comes to lie near the other one."""
 BEYOND = -1
 """The place of a sample of a scan that lies past a border of the reference, or on another side of it."""
 
@@ -92,19 +95,19 @@ class Measured:
     """All else, as JSON knows it."""
 
 
-def measure_file(scan: ScanFile, specimen: Specimen, surface: SignedDistance, options: StudyOptions) -> Measured:
-    """Read and measure one scan; ``surface`` is that of the specimen. Raises InputError where it has no part in the
-    study, and says why."""
+def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> Measured:
+    """Read and measure one scan. Raises InputError where it has no part in the study, and says why."""
     mesh, told = _read(scan, specimen)
-    rough = _register(mesh, specimen, surface, options)
+    rough = _register(mesh, specimen, options)
     samples, _ = mesh.sample(options.samples, np.random.default_rng([options.seed, 1]))
     pose, parts, missed = _aligned(scan, mesh, samples, specimen, rough.reference_from_scan, options)
     aligned = mesh.transformed(pose)
     points = pose.apply(samples)
     against = SignedDistance(aligned)
-    sample_um, sample_place, piece = _onto_reference(points, aligned, specimen, surface)
+    sample_um, sample_place, piece = _onto_reference(points, specimen)
     place_um = deviations_um(specimen.places, against, options.farthest_mm)
-    stations = {**_pieces(points, sample_um, piece, specimen, surface, options), **parts}
+    deformation = _deformation(specimen, against, place_um)
+    stations = {**_pieces(points, sample_um, piece, specimen, deformation, options), **parts}
     return Measured(
         place_um=place_um.astype(np.float32),
         sample_um=sample_um.astype(np.float32),
@@ -115,7 +118,7 @@ def measure_file(scan: ScanFile, specimen: Specimen, surface: SignedDistance, op
             "overlap": rough.overlap,
             "similarity_scale_ppm": 1e6 * (rough.scale - 1),
             "notes": [*told["notes"], *rough.notes, *missed],
-            "deformation": _deformation(specimen, against, place_um),
+            "deformation": None if deformation is None else asdict(deformation),
             "spans": [asdict(span) for kind, found in _kinds(stations).items() for span in spans(kind, found)],
             "shifts": [_shift(kind, label, station) for (kind, label), station in stations.items()],
         },
@@ -133,26 +136,26 @@ def write_measured(folder: Path, key: str, measured: Measured, *, made_from: str
 
 
 def _read(scan: ScanFile, specimen: Specimen) -> tuple[Mesh, dict[str, Any]]:
-    like = MeasuredFile(path=scan.path, mesh=specimen.mesh, unit="mm")
-    unit, odd = guessed_unit(scan.path, like_mm=like.width_mm)
-    mesh, facing = facing_outwards(storage.read_mesh(scan.path, unit))
+    read = storage.read_mesh(scan.path)
+    unit, odd = guessed_unit(scan.path, read, like_mm=specimen.width_mm)
+    mesh, mending = mended(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     # From here on in the frame that the reference was turned into: without an alignment both stay together.
     return mesh.transformed(specimen.occlusal_from_file), {
         "unit": unit,
         "faces": len(mesh.faces),
         "area_mm2": float(mesh.face_areas.sum()),
-        "notes": [*([] if odd is None else [odd]), *facing],
+        "notes": [*([] if odd is None else [odd]), *mending, *cut_notes(mesh)],
     }
 
 
-def _register(mesh: Mesh, specimen: Specimen, surface: SignedDistance, options: StudyOptions) -> Alignment:
-    rng = np.random.default_rng([options.seed, 0])
+def _register(mesh: Mesh, specimen: Specimen, options: StudyOptions) -> Alignment:
+    rng, surface = np.random.default_rng([options.seed, 0]), specimen.reference_surface
     if options.align == "none":
         points, _ = mesh.sample(options.registration.samples, rng)
         scale = best_scale(points, surface, Rigid3.identity(), options.registration)
         near = np.abs(surface.closest_points(points).signed_mm) < options.registration.outlier_mm
         return Alignment(reference_from_scan=Rigid3.identity(), scale=scale, rms_um=0.0, overlap=float(near.mean()))
-    found = register(mesh, surface, options.registration, rng=rng)
+    found = _found_fast(mesh, surface, options.registration) or register(mesh, surface, options.registration, rng=rng)
     if found.mirrored:
         raise InputError("a mirror image of the reference; mirror it back, or give the reference of its own specimen")
     if found.overlap < options.least_overlap:
@@ -161,6 +164,17 @@ def _register(mesh: Mesh, specimen: Specimen, surface: SignedDistance, options: 
             f"it seems to show something else than specimen {specimen.name}"
         )
     return found
+
+
+def _found_fast(mesh: Mesh, surface: SignedDistance, options: RegistrationOptions) -> Alignment | None:
+    """An alignment by few poses, where nothing about it is in doubt."""
+    given = options.search
+    search = replace(given, **{name: min(getattr(given, name), most) for name, most in _FEW_POSES.items()})
+    try:
+        found = register(mesh, surface, replace(options, search=search), rng=np.random.default_rng(0))
+    except InputError:
+        return None
+    return None if found.notes or found.overlap < _SURE_OVERLAP else found
 
 
 Parts = dict[tuple[str, str], Station]
@@ -196,7 +210,8 @@ def _pose(
         if not faces.any():
             what = "reference area (--align-teeth, or <specimen>.area.ply)" if kind == "area" else "crowns"
             raise InputError(f"specimen {specimen.name} has no {what} to align on")
-        return align_on_area(samples, specimen.mesh.submesh(faces), rough, options.registration)
+        surface = specimen.area_surface if kind == "area" else specimen.crown_surface
+        return align_on_area(samples, surface, rough, options.registration)
     chosen = {label: part for (of, label), part in parts.items() if of == kind}
     return align_points(
         {label: part.measured.translation for label, part in chosen.items()},
@@ -235,10 +250,10 @@ def _found_bodies(
     mesh: Mesh, specimen: Specimen, rough: Rigid3, options: StudyOptions, missed: list[str]
 ) -> dict[str, BodyFit]:
     found: dict[str, BodyFit] = {}
-    if specimen.body is None:
+    library = specimen.body_surface
+    if library is None:
         return found
-    library = SignedDistance(specimen.body)
-    middle, scan_from_reference = specimen.body.bounds.mean(axis=0), rough.inverse()
+    middle, scan_from_reference = library.mesh.bounds.mean(axis=0), rough.inverse()
     for label, nominal in specimen.bodies.items():
         expected = scan_from_reference @ nominal
         try:
@@ -255,12 +270,12 @@ def _point(nominal: Float[np.ndarray, "3"], measured: Float[np.ndarray, "3"]) ->
 
 
 def _onto_reference(
-    points: Float[np.ndarray, "s 3"], aligned: Mesh, specimen: Specimen, surface: SignedDistance
+    points: Float[np.ndarray, "s 3"], specimen: Specimen
 ) -> tuple[Float[np.ndarray, "s"], Int[np.ndarray, "s"], Int[np.ndarray, "s"]]:
     """Signed distances of samples (um), the place next to each, and the piece that it is on."""
-    closest = surface.closest_points(points)
+    closest = specimen.reference_surface.closest_points(points)
     on_surface = points - closest.signed_mm[:, None] * closest.directions
-    place = np.asarray(KDTree(specimen.places.points).query(on_surface)[1])
+    place = np.asarray(specimen.place_tree.query(on_surface)[1])
     beyond = closest.on_border
     piece = np.where(beyond, 0, specimen.piece[place])
     return 1000 * closest.signed_mm, np.where(beyond, BEYOND, place), piece
@@ -271,26 +286,41 @@ def _pieces(
     sample_um: Float[np.ndarray, "s"],
     piece: Int[np.ndarray, "s"],
     specimen: Specimen,
-    surface: SignedDistance,
+    deformation: Deformation | None,
     options: StudyOptions,
 ) -> Parts:
-    """Teeth, or stations along the arch, as rigid parts."""
-    near = np.abs(sample_um) < 1000 * options.farthest_mm
-    sizes = {each: int(np.sum(specimen.piece == each)) for each in specimen.pieces}
-    centroids = {
-        each: specimen.places.points[specimen.piece == each].mean(axis=0)
-        for each, size in sizes.items()
-        if size >= _LEAST_PIECE
-    }
-    found = find_teeth(points[near], piece[near], centroids, surface, options.registration, order=specimen.pieces)
+    """Teeth, or stations along the arch, as rigid parts of a scan that its modes are taken out of: a bend within a part
+    would shift its rigid fit."""
+    used = (np.abs(sample_um) < 1000 * options.farthest_mm) & (piece != GUM)
+    places = {each: specimen.places.points[specimen.piece == each] for each in specimen.pieces}
+    centroids = {each: at.mean(axis=0) for each, at in places.items() if len(at) >= _LEAST_PIECE}
+    curve = specimen.arch_curve
+    straight = points[used]
+    if curve is not None and deformation is not None:
+        straight = straighten(curve, deformation.amplitudes, straight)
+    found = find_teeth(
+        straight, piece[used], centroids, specimen.reference_surface, options.registration, order=specimen.pieces
+    )
     kind = "teeth" if specimen.labelled else "stations"
-    return {(kind, specimen.piece_name(each)): _as_station(tooth, surface) for each, tooth in found.items()}
+    return {
+        (kind, specimen.piece_name(each)): _as_station(tooth, places[each], specimen, deformation)
+        for each, tooth in found.items()
+    }
 
 
-def _as_station(tooth: ScannedTooth, surface: SignedDistance) -> Station:
-    pose = tooth.reference_from_scan
-    measured = Rigid3(pose.inverse().rotation, located(tooth.points, surface, pose, tooth.centroid))
-    return Station(nominal=Rigid3(np.eye(3), tooth.centroid), measured=measured)
+def _as_station(
+    tooth: ScannedTooth, places: Float[np.ndarray, "n 3"], specimen: Specimen, deformation: Deformation | None
+) -> Station:
+    """Where a part lies in the scan: its own motion first, then what the modes do to it there."""
+    centroid, pose, curve = tooth.centroid, tooth.reference_from_scan, specimen.arch_curve
+    middle = located(tooth.points, specimen.reference_surface, pose, centroid)
+    measured = Rigid3(pose.inverse().rotation, middle)
+    if curve is not None and deformation is not None:
+        moved = middle + measured.rotate(places - centroid)
+        bent = bend(curve, deformation.amplitudes, moved)
+        _, turn, _ = best_similarity(moved, bent)
+        measured = Rigid3(turn @ measured.rotation, bent.mean(axis=0))
+    return Station(nominal=Rigid3(np.eye(3), centroid), measured=measured)
 
 
 def _kinds(stations: Mapping[tuple[str, str], Station]) -> dict[str, dict[str, Station]]:
@@ -321,7 +351,7 @@ def _axis_deg(station: Station) -> float | None:
     return angle_between_deg(station.measured.rotate(axis), station.nominal.rotate(axis))
 
 
-def _deformation(specimen: Specimen, scan: SignedDistance, place_um: Float[np.ndarray, "p"]) -> dict[str, Any] | None:
+def _deformation(specimen: Specimen, scan: SignedDistance, place_um: Float[np.ndarray, "p"]) -> Deformation | None:
     """The modes of the arch, fitted to places on crowns that the scan shows, or on all surface without any."""
     curve = specimen.arch_curve
     if curve is None:
@@ -330,5 +360,4 @@ def _deformation(specimen: Specimen, scan: SignedDistance, place_um: Float[np.nd
     chosen = np.flatnonzero(asked)
     thinned = np.zeros(len(asked), dtype=bool)
     thinned[chosen[:: max(1, len(chosen) // _FITTED_PLACES)]] = True
-    found = fit_deformation(specimen.places.chosen(thinned), curve, scan)
-    return None if found is None else asdict(found)
+    return fit_deformation(specimen.places.chosen(thinned), curve, scan)

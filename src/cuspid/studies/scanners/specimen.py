@@ -30,9 +30,11 @@ from cuspid.model.jaw import GUM, Arch, Jaw, Sphere
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import CuspidError, InputError
 from cuspid.runtime.values import LONGEST_MM, number
+from cuspid.runtime.workers import computed_once
 from cuspid.storage import MM_PER_UNIT, MeasuredFile, Unit
 from cuspid.storage.files import read_arrays, write_arrays
 from cuspid.studies.scanners.files import area_file, beside, body_file, landmark_file
+from cuspid.studies.scanners.soundness import cut_notes, first_of_each, mended
 
 PLACES = 60_000
 """Number of places on a reference."""
@@ -87,6 +89,36 @@ class Specimen:
     arch: Arch | None
     notes: tuple[str, ...]
 
+    @computed_once
+    def width_mm(self) -> float:
+        """The largest extent of the reference."""
+        return MeasuredFile(path=Path(self.name), mesh=self.mesh, unit="mm").width_mm
+
+    @computed_once
+    def reference_surface(self) -> SignedDistance:
+        """Distances to the reference."""
+        return SignedDistance(self.mesh)
+
+    @computed_once
+    def area_surface(self) -> SignedDistance:
+        """Distances to the reference area."""
+        return SignedDistance(self.mesh.submesh(self.area_faces))
+
+    @computed_once
+    def crown_surface(self) -> SignedDistance:
+        """Distances to the crowns."""
+        return SignedDistance(self.mesh.submesh(self.crown_faces))
+
+    @computed_once
+    def body_surface(self) -> SignedDistance | None:
+        """Distances to the library's scan body."""
+        return None if self.body is None else SignedDistance(self.body)
+
+    @computed_once
+    def place_tree(self) -> KDTree:
+        """Of the places."""
+        return KDTree(self.places.points)
+
     @property
     def arch_curve(self) -> ArchCurve | None:
         """The line along the crowns."""
@@ -111,10 +143,10 @@ class Specimen:
         return tuple(piece for piece in order if piece in there)
 
 
-def guessed_unit(path: Path, like_mm: float | None = None) -> tuple[Unit, str | None]:
-    """The unit of a mesh file by its size, which is that of teeth or jaws, or nearly ``like_mm`` where that is known;
-    and what is odd about it. Raises InputError where no unit fits."""
-    file = MeasuredFile(path=path, mesh=storage.read_mesh(path), unit="mm")
+def guessed_unit(path: Path, mesh: Mesh, like_mm: float | None = None) -> tuple[Unit, str | None]:
+    """The unit of a file whose mesh was read in mm, by its size, which is that of teeth or jaws, or nearly ``like_mm``
+    where that is known; and what is odd about it. Raises InputError where no unit fits."""
+    file = MeasuredFile(path=path, mesh=mesh, unit="mm")
     low, high = _SIZES_MM if like_mm is None else (like_mm / 3, like_mm * 3)
     if low <= file.width_mm <= high:
         return "mm", None
@@ -140,7 +172,7 @@ def load_specimen(
     align_teeth: tuple[int, ...] = (),
 ) -> Specimen:
     """The reference of a specimen and what lies beside it. Raises InputError where it cannot be used."""
-    read_in, odd = (unit, None) if unit is not None else guessed_unit(path)
+    read_in, odd = (unit, None) if unit is not None else guessed_unit(path, storage.read_mesh(path))
     jaw, occlusal_from_file, notes = _load_reference(path, read_in, arch, labelling)
     mesh, mm = jaw.mesh, MM_PER_UNIT[read_in]
     area = _area_of(path, jaw, occlusal_from_file, read_in, align_teeth)
@@ -194,10 +226,13 @@ def _load_reference(
     if storage.is_jaw(path):
         return storage.read_jaw(path), Rigid3.identity(), ()
     mesh, labels, _ = storage.read_labelled_mesh(path, unit)
+    keep, doubled = first_of_each(mesh)
+    if doubled:
+        mesh, labels = mesh.submesh(keep), None if labels is None else labels[keep]
     mesh, facing = facing_outwards(mesh)
     occlusal = find_occlusal_frame(mesh)
     upright = mesh.transformed(occlusal.occlusal_from_mesh)
-    notes = (*facing, *occlusal.notes)
+    notes = (*doubled, *facing, *cut_notes(mesh), *occlusal.notes)
     arch = arch or named_arch(path)
     if labels is not None:
         try:
@@ -306,8 +341,9 @@ def _bodies_of(
     table, library = beside(path, [".bodies.csv"]), body_file(path)
     if table is None or library is None:
         return None, {}, ()
-    unit, _ = guessed_unit(library, like_mm=8.0)
-    body, _ = facing_outwards(storage.read_mesh(library, unit))
+    read = storage.read_mesh(library)
+    unit, _ = guessed_unit(library, read, like_mm=8.0)
+    body, _ = mended(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     surface = SignedDistance(body)
     found, notes = {}, []
     for row in storage.read_table(table, ("label", "x", "y", "z")):

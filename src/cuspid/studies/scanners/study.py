@@ -16,7 +16,6 @@ import numpy as np
 
 from cuspid import storage
 from cuspid.anatomy.jaw_files import Labelling
-from cuspid.evaluation.distance import SignedDistance
 from cuspid.model.jaw import Arch
 from cuspid.runtime.errors import CuspidError, InputError
 from cuspid.runtime.progress import Progress, silent
@@ -300,7 +299,6 @@ def measure_share(*, keys: str, out: Path, options: StudyOptions) -> dict[str, V
     """Measure some scans of one specimen, listed in ``scans/left.json``; each that fails says why in its record."""
     listed = storage.read_json(out / "scans" / "left.json")
     specimen = specimen_of(out, listed[keys.split()[0]]["specimen"])
-    surface = SignedDistance(specimen.mesh)
     failed = 0
     for key in keys.split():
         entry = listed[key]
@@ -313,7 +311,7 @@ def measure_share(*, keys: str, out: Path, options: StudyOptions) -> dict[str, V
             factors=entry["factors"],
         )
         try:
-            measured = measure_file(scan, specimen, surface, options)
+            measured = measure_file(scan, specimen, options)
             if storage.hash_file(scan.path) != entry["digest"]:
                 raise InputError("the file changed while the study ran; run the same command again")
             write_measured(out / "scans", key, measured, made_from=entry["made_from"], sha256=entry["digest"])

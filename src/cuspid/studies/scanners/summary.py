@@ -6,7 +6,7 @@ deviations at the places of the reference are held at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -19,15 +19,15 @@ from cuspid import storage
 from cuspid.anatomy.surfaces import SURFACES
 from cuspid.evaluation.deviation import statistics
 from cuspid.evaluation.places import Places, SmallMotion, best_motion
-from cuspid.evaluation.repeatability import PairOptions, compare_pair
+from cuspid.evaluation.repeatability import LIMIT_FACTOR, PairOptions, compare_pair
 from cuspid.geometry import Rigid3
-from cuspid.model.facing import facing_outwards
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.progress import Progress, silent
 from cuspid.storage.files import read_arrays
 from cuspid.studies.scanners.files import Remark, ScanFile
 from cuspid.studies.scanners.scan import BEYOND, Measured, StudyOptions
+from cuspid.studies.scanners.soundness import mended
 from cuspid.studies.scanners.specimen import SEGMENTS, Specimen
 
 WITHIN_UM = (10, 25, 50, 100)
@@ -49,7 +49,7 @@ class Common:
     scans: tuple[ScanFile, ...]
     """The scans that have a part in it."""
     remarks: tuple[Remark, ...]
-    """Which scans are partial, and what all show."""
+    """Which scans are partial, which scanner has but one, and what all show."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,6 +108,11 @@ def find_common(specimen: Specimen, scans: Sequence[ScanFile], folder: Path, opt
             remarks.append(Remark(what=scan.name, why=why, left_out=True))
         else:
             kept.append(scan)
+    made = [scan.scanner for scan in kept]
+    for scanner in dict.fromkeys(made):
+        if made.count(scanner) == 1:
+            why = f"one scan of {specimen.name} alone: its precision cannot be told"
+            remarks.append(Remark(what=scanner, why=why))
     common = np.all([shown[scan.key] for scan in kept], axis=0)
     if common.sum() < _LEAST_SAMPLES:
         raise InputError(
@@ -355,7 +360,7 @@ def _mesh_to_mesh(one: Compared, other: Compared, specimen: Specimen, options: S
 
 def _aligned_mesh(each: Compared, specimen: Specimen) -> Mesh:
     unit = each.measured.told["unit"]
-    mesh, _ = facing_outwards(storage.read_mesh(each.scan.path, unit))
+    mesh, _ = mended(storage.read_mesh(each.scan.path, unit))
     pose = Rigid3.from_matrix(np.array(each.measured.told["reference_from_scan"])) @ specimen.occlusal_from_file
     return mesh.transformed(pose if each.motion is None else each.motion.rigid @ pose)
 
@@ -391,7 +396,8 @@ def group_row(group: Sequence[Compared], found: Group, pairs: Sequence[Row], sca
         "precision_mean_abs_um": float(np.mean([row["mean_abs_um"] for row in pairs])) if pairs else None,
         "precision_rms_um": float(np.mean([row["rms_um"] for row in pairs])) if pairs else None,
         "repeatability_sd_um": None if random is None else float(np.sqrt(random)),
-        "repeatability_limit_um": None if random is None else float(2.8 * np.sqrt(random)),
+        "median_sd_um": None if random is None else float(np.median(sd)),
+        "repeatability_limit_um": None if random is None else float(LIMIT_FACTOR * np.sqrt(random)),
         "systematic_rms_um": None
         if random is None
         else float(np.sqrt(max(0.0, float(np.mean(mean**2)) - random / found.count))),
@@ -432,7 +438,7 @@ def summarise(
                 keep(group[-1], specimen)
                 done += 1
                 progress("figures", done, total)
-            remarks += _add_group(tables, group, specimen, common, options, keep_group)
+            _add_group(tables, group, specimen, common, options, keep_group)
     return tables, tuple(remarks)
 
 
@@ -443,7 +449,7 @@ def _add_group(
     common: Common,
     options: StudyOptions,
     keep_group: Callable[[Group, Specimen], None],
-) -> Iterable[Remark]:
+) -> None:
     rows = [scan_row(each, common) for each in group]
     spreads = spread_from_mean_um(group, common, specimen.places, align=options.align != "none")
     for row, spread in zip(rows, spreads, strict=True):
@@ -458,7 +464,3 @@ def _add_group(
         tables.spans.extend({**levels, **span} for span in each.measured.told["spans"])
         tables.shifts.extend({**levels, **shift} for shift in each.measured.told["shifts"])
     keep_group(mean, specimen)
-    if len(group) == 1:
-        why = f"one scan of {specimen.name} alone: its precision cannot be told"
-        return [Remark(what=group[0].scan.scanner, why=why)]
-    return []

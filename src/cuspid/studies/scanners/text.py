@@ -42,8 +42,9 @@ def methods(options: StudyOptions, summary: Mapping[str, Any]) -> str:
     if align != "none":
         lines.append(
             f"Starting poses were searched exhaustively ({search.anchors} anchors on {search.targets} targets in steps "
-            f"of {search.turn_step_deg:g} deg); the fit minimised point-to-surface distances of "
-            f"{registration.samples} samples by Gauss-Newton with Tukey's biweight (six robust standard deviations), "
+            f"of {search.turn_step_deg:g} deg, after a search of fewer where that left a doubt); the fit minimised "
+            f"point-to-surface distances of {registration.samples} samples "
+            "by Gauss-Newton with Tukey's biweight (six robust standard deviations), "
             f"until no sample moved by more than {registration.tolerance_um:g} um."
         )
     if align == "best-fit":
