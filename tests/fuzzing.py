@@ -15,6 +15,7 @@ import resource
 import shutil
 import signal
 import tempfile
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -985,6 +986,7 @@ def captured(into: Path) -> Iterator[None]:
 def wrong_with(use: Callable[[], object], said: Path) -> str | None:
     """What is wrong with how damaged input was taken; None where nothing is."""
     message, status = "", 0
+    warnings.filterwarnings("ignore", module="PIL")  # as the command line does, for what reads without it
     try:
         with captured(said), limited():
             try:
