@@ -87,7 +87,7 @@ _PAPILLA_BELOW_MM = 1.0
 SIGMA_MM: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
         "canine.cusp_tip": (0.08, 0.07),
-        "canine.distal_angle": (0.31, 0.67),
+        "canine.distal_angle": (0.31, 0.68),
         "canine.labial_cervix": (0.12, 0.06),
         "canine.lingual_cervix": (0.13, 0.00),
         "canine.mesial_angle": (0.21, 0.37),
@@ -98,16 +98,16 @@ SIGMA_MM: Mapping[str, tuple[float, float]] = MappingProxyType(
         "incisor.mesial_angle": (0.13, 0.21),
         "midline": (0.00, 0.23),
         "molar.buccal_groove": (0.04, 0.07),
-        "molar.central_groove": (0.21, 0.00),
-        "molar.distobuccal_cusp": (0.15, 0.04),
+        "molar.central_groove": (0.16, 0.07),
+        "molar.distobuccal_cusp": (0.16, 0.03),
         "molar.mesiobuccal_cusp": (0.14, 0.05),
         "molar.mesiolingual_cusp": (0.13, 0.05),
         "papilla": (0.00, 0.24),
         "premolar.buccal_cervix": (0.08, 0.06),
         "premolar.buccal_cusp": (0.03, 0.04),
-        "premolar.central_groove": (0.16, 0.06),
+        "premolar.central_groove": (0.14, 0.07),
         "premolar.lingual_cervix": (0.10, 0.06),
-        "premolar.lingual_cusp": (0.35, 0.00),
+        "premolar.lingual_cusp": (0.18, 0.00),
     }
 )
 """Standard uncertainty (one axis) of each kind of point: a constant in mm, and a share of the edge length of the mesh.
