@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from cuspid_thesis.catalogue import TABLE_3_2
@@ -175,6 +176,58 @@ def landmarks(result: Result) -> str:
             markdown_table(("point", "count", "median mm", "P90 mm", "error / stated"), kinds),
         ]
     )
+
+
+def orientation(result: Result) -> str:
+    """Whole jaws and quadrants in any pose."""
+    jaws, quadrants, limit = result["jaws"], result["quadrants"], f"{result['within_deg']:g}"
+    whole = {name: found for name, found in jaws.items() if not found["doubted"]}
+    rows = [
+        (
+            name,
+            *(f"{found[angle][figure]:.1f}" for angle in ("tilt_deg", "turn_deg") for figure in ("median", "max")),
+            f"{found['doubted']} of {found['poses']}",
+            {None: "-", True: "yes", False: "**no**"}[found["labels_agree"]],
+        )
+        for name, found in jaws.items()
+    ]
+    halves = {
+        name: [each for each in quadrants.values() if each["looked_at_only_at_the_end"] == at_the_end]
+        for name, at_the_end in (("looked at", False), ("looked at only at the end", True))
+    }
+    off = max((found[angle]["max"] for found in whole.values() for angle in ("tilt_deg", "turn_deg")), default=0.0)
+    undoubted = sum(found["wrong_undoubted"] for found in (*jaws.values(), *quadrants.values()))
+    return "\n".join(
+        [
+            f"{len(jaws)} jaws of other people, each in {max(each['poses'] for each in jaws.values())} poses, against "
+            f"how they come out as their file has them, in degrees. The {len(whole)} that are never doubted are "
+            f"{off:.1f} off at most. More than {limit} off and not doubted: {mark(undoubted, 0, 0)} (bar 0), quadrants "
+            "included.",
+            "",
+            markdown_table(
+                ("jaw", "tilt", "largest", "turn", "largest", "doubted", "crowns up and front first by labels"), rows
+            ),
+            "",
+            "Quadrants cut from those with labels, 3 mm of gum around them, against the jaw that they are of; all are "
+            "to be doubted in one line:",
+            "",
+            markdown_table(
+                ("quadrants", "poses", "tilt", "largest", "turn", "largest", f"> {limit} off", "doubted"),
+                [_quadrant_row(name, found) for name, found in halves.items() if found],
+            ),
+        ]
+    )
+
+
+def _quadrant_row(name: str, found: Sequence[Result]) -> tuple[object, ...]:
+    poses = sum(each["poses"] for each in found)
+    figures = (
+        f"{figure([each[angle][which] for each in found]):.1f}"
+        for angle in ("tilt_deg", "turn_deg")
+        for which, figure in (("median", median), ("max", max))
+    )
+    counts = (f"{sum(each[which] for each in found)} of {poses}" for which in ("wrong", "doubted"))
+    return (f"{len(found)}, {name}", poses, *figures, *counts)
 
 
 def _widths(widths: Mapping[str, Mapping[str, float]]) -> str:
