@@ -60,6 +60,8 @@ _ENOUGH_FACES = 500_000
 """More say no more of how a jaw lies."""
 _TILT_SD_DEG = 30.0
 """Standard deviation of what the outside of a scan, or the plane on which it rests, tells of its tilt."""
+_PART_TILT_SD_DEG = 15.0
+"""The same for a part of an arch, seen from where most of it is rough: its tips lie nearly on a line."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,10 +118,13 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     if len(crowns) == 0:
         note = "occlusal frame: unsure, as nothing looks like a crown; check the picture"
         return OcclusalFrame(occlusal_from_mesh=level, notes=(*notes, note))
-    anterior, whole = _anterior(crowns[:, :2])
-    if not whole:
-        relief, level = _level_frame(mesh, _roughest(mesh, start))
-        crowns, notes = relief.crowns(), (*notes, _PART_NOTE)
+    anterior, one_way = _anterior(crowns[:, :2])
+    wide = _width_mm(crowns[:, :2]) > _NARROW_ARCH_MM
+    if not (wide and one_way):
+        notes = (*notes, _PART_NOTE)
+    if not wide:
+        relief, level = _level_frame(mesh, _roughest(mesh, start), _PART_TILT_SD_DEG)
+        crowns = relief.crowns()
         anterior = _anterior_of_part(crowns[:, :2], relief.edges()[:, :2])
     centre = np.array([*crowns[:, :2].mean(axis=0), relief.tips()[:, 2].mean()])
     turn = np.array([[anterior[1], -anterior[0], 0], [anterior[0], anterior[1], 0], [0, 0, 1.0]])
@@ -204,9 +209,9 @@ def _roughness(relief: _Relief) -> float:
     return float(np.arccos(np.clip(cosines[known], -1, 1)).mean()) if known.any() else 0.0
 
 
-def _level_frame(mesh: Mesh, start: Rigid3) -> tuple[_Relief, Rigid3]:
+def _level_frame(mesh: Mesh, start: Rigid3, tilt_sd_deg: float = _TILT_SD_DEG) -> tuple[_Relief, Rigid3]:
     """A frame turned so that the tips of the crowns lie in the plane XY on average, and what is seen from there."""
-    frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, _TILT_SD_DEG) @ start
+    frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, tilt_sd_deg) @ start
     return _relief(mesh, frame), frame
 
 
@@ -228,7 +233,7 @@ def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
 
 def _anterior(crowns: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], bool]:
     """Unit vector towards anterior, from the places of the crowns seen from above: how an arch fits them best. And
-    whether they are those of a whole arch, which fits one way only."""
+    whether it fits well, and one way only."""
     places = crowns[:: max(1, len(crowns) // 1000)]
     angles = np.deg2rad(np.arange(0, 360, 20.0))
     halves = np.linspace(-1, 1, 61)
@@ -238,7 +243,7 @@ def _anterior(crowns: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"],
     best = int(np.argmin(misfits))
     rivals = misfits[directions @ directions[best] < np.cos(np.deg2rad(60))]
     one_way = misfits[best] < _ARCH_MISFIT_MM and (len(rivals) == 0 or misfits[best] < 0.85 * rivals.min())
-    return _midline(places, directions[best]), bool(one_way and _width_mm(crowns) > _NARROW_ARCH_MM)
+    return _midline(places, directions[best]), bool(one_way)
 
 
 def _anterior_of_part(crowns: Float[np.ndarray, "n 2"], edges: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "2"]:
