@@ -52,6 +52,17 @@ def test_a_quadrant_with_its_base_lies_crowns_up_and_is_doubted(seed: int):
     assert any("which way is up" in note for note in found.notes)
 
 
+def test_a_wide_jaw_that_no_whole_arch_fits_is_doubted_and_keeps_its_frame(monkeypatch: pytest.MonkeyPatch):
+    """Of a cast without its molars, say, only the front is doubtful."""
+    mesh = horseshoe(120, 40).mesh.transformed(any_pose(1, 300))
+    sure = find_occlusal_frame(mesh)
+    monkeypatch.setattr("cuspid.anatomy.orientation._ARCH_MISFIT_MM", 0.0)
+    found = find_occlusal_frame(mesh)
+    assert len(found.notes) == 1
+    assert sure.notes == ()
+    assert (found.occlusal_from_mesh @ sure.occlusal_from_mesh.inverse()).angle_deg < 1e-6
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_front_of_a_quadrant_is_where_its_crowns_are_narrow(side: int):
     """On either side of the jaw, and from any direction in the plane; its mirror image has its front where it has."""
