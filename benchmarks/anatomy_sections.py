@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from cuspid_thesis.catalogue import TABLE_3_2
@@ -150,28 +151,89 @@ def landmarks(result: Result) -> str:
         )
         for name, found in real["arches"].items()
     ]
-    total, held = real["all"], real["looked_at_only_at_the_end"]
-    widths = ", ".join(
-        f"{name.replace('_', '-')} {found['median_abs_mm']:.2f} (largest {found['max_abs_mm']:.2f})"
-        for name, found in real["widths"].items()
-    )
+    total, held, sure = real["all"], real["looked_at_only_at_the_end"], real["without_those_in_doubt"]
+    doubts = "; ".join(f"{label}: {why}" for label, why in real["in_doubt"].items())
     return "\n".join(
         [
             f"Six real arches with landmarks that people set: {total['count']} are the same points as ours. Median "
             f"{mark(total['median_mm'], 0.35)} mm (bar 0.35), P90 {mark(total['p90_mm'], 1.0)} mm (bar 1.0), "
             f"{total['beyond_1_mm_pct']:.0f} % beyond 1 mm; error over stated uncertainty {total['over_stated']:.1f}. "
-            f"On the three that were looked at only at the end: {held['median_mm']:.2f} and {held['p90_mm']:.2f} mm. "
-            "Widths, median error in mm (bars 0.5, largest 1.2): "
-            f"{widths}. Not counted, as they do not lie on their tooth: "
+            f"On the three that were looked at only at the end: {held['median_mm']:.2f} and {held['p90_mm']:.2f} mm, "
+            f"error over stated uncertainty {held['over_stated']:.1f}. Widths, median error in mm (bars 0.5, largest "
+            f"1.2): {_widths(real['widths'])}. Not counted, as they do not lie on their tooth: "
             f"{', '.join(real['not_on_their_tooth']) or 'none'}.",
+            "",
+            f"Counted, but pictures of the teeth speak against them ({doubts}); without them median "
+            f"{sure['median_mm']:.2f}, P90 {sure['p90_mm']:.2f} mm, error over stated uncertainty "
+            f"{sure['over_stated']:.1f}; {_widths(sure['widths'])}.",
             "",
             markdown_table(("arch", "points", "median mm", "P90 mm", "> 1 mm, %", *real["widths"]), arches),
             "",
             f"{2 * phantoms['seeds']} phantoms with edges of {' and '.join(map(str, phantoms['edges_mm']))} mm; over "
-            f"all points the error is {phantoms['all']['over_stated']:.2f} times the stated uncertainty:",
+            f"all points the error is {phantoms['all']['over_stated']:.2f} times the stated uncertainty, which is "
+            "that of real teeth:",
             "",
             markdown_table(("point", "count", "median mm", "P90 mm", "error / stated"), kinds),
         ]
+    )
+
+
+def orientation(result: Result) -> str:
+    """Whole jaws and quadrants in any pose."""
+    jaws, quadrants, limit = result["jaws"], result["quadrants"], f"{result['within_deg']:g}"
+    whole = {name: found for name, found in jaws.items() if not found["doubted"]}
+    rows = [
+        (
+            name,
+            *(f"{found[angle][figure]:.1f}" for angle in ("tilt_deg", "turn_deg") for figure in ("median", "max")),
+            f"{found['doubted']} of {found['poses']}",
+            {None: "-", True: "yes", False: "**no**"}[found["labels_agree"]],
+        )
+        for name, found in jaws.items()
+    ]
+    halves = {
+        name: [each for each in quadrants.values() if each["looked_at_only_at_the_end"] == at_the_end]
+        for name, at_the_end in (("looked at", False), ("looked at only at the end", True))
+    }
+    off = max((found[angle]["max"] for found in whole.values() for angle in ("tilt_deg", "turn_deg")), default=0.0)
+    undoubted = sum(found["wrong_undoubted"] for found in (*jaws.values(), *quadrants.values()))
+    return "\n".join(
+        [
+            f"{len(jaws)} jaws of other people, each in {max(each['poses'] for each in jaws.values())} poses, against "
+            f"how they come out as their file has them, in degrees. The {len(whole)} that are never doubted are "
+            f"{off:.1f} off at most. More than {limit} off and not doubted: {mark(undoubted, 0, 0)} (bar 0), quadrants "
+            "included.",
+            "",
+            markdown_table(
+                ("jaw", "tilt", "largest", "turn", "largest", "doubted", "crowns up and front first by labels"), rows
+            ),
+            "",
+            "Quadrants cut from those with labels, 3 mm of gum around them, against the jaw that they are of; all are "
+            "to be doubted in one line:",
+            "",
+            markdown_table(
+                ("quadrants", "poses", "tilt", "largest", "turn", "largest", f"> {limit} off", "doubted"),
+                [_quadrant_row(name, found) for name, found in halves.items() if found],
+            ),
+        ]
+    )
+
+
+def _quadrant_row(name: str, found: Sequence[Result]) -> tuple[object, ...]:
+    poses = sum(each["poses"] for each in found)
+    figures = (
+        f"{figure([each[angle][which] for each in found]):.1f}"
+        for angle in ("tilt_deg", "turn_deg")
+        for which, figure in (("median", median), ("max", max))
+    )
+    counts = (f"{sum(each[which] for each in found)} of {poses}" for which in ("wrong", "doubted"))
+    return (f"{len(found)}, {name}", poses, *figures, *counts)
+
+
+def _widths(widths: Mapping[str, Mapping[str, float]]) -> str:
+    return ", ".join(
+        f"{name.replace('_', '-')} {found['median_abs_mm']:.2f} (largest {found['max_abs_mm']:.2f})"
+        for name, found in widths.items()
     )
 
 

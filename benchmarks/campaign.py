@@ -78,6 +78,8 @@ BENCHMARKS = (
     Benchmark("visibility", "visibility.py --out {out}"),
     Benchmark("mouth", "mouth.py --out {out}"),
     Benchmark("measure", "measure_jaws.py --jaws {jaws}/iosseg --out {out}"),
+    Benchmark("landmarks", "landmarks.py --data {jaws}/landmarked --out {out}"),
+    Benchmark("orientation", "orientation.py {jaws} --out {out}"),
     Benchmark("populations", "populations.py --out {out}"),
     Benchmark("camera_pair", "camera_pair.py --pictures {work} --out {out}"),
     Benchmark("targets", "targets.py --work {work} --out {out}"),

@@ -65,6 +65,7 @@ MAKERS: Mapping[str, Maker] = {
     "mouth": Maker("mouth"),
     "measure": Maker("measure_jaws"),
     "landmarks": Maker("landmarks"),
+    "orientation": Maker("orientation"),
     "populations": Maker("populations"),
     "mean_shape": Maker("mean_shape", ("jaws", "surveys")),
     "visibility": Maker("visibility"),

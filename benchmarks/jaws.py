@@ -114,14 +114,16 @@ def _manifold(mesh: Mesh) -> Mesh:
     return mesh.submesh(np.asarray(alone.all(axis=1)))
 
 
-def cut_out(jaw: Jaw, teeth: tuple[int, ...], *, gaps: bool) -> Mesh:
-    """Teeth with 3 mm of gum, also around teeth that are taken out where these leave gaps, in any pose."""
+def cut_out(jaw: Jaw, teeth: tuple[int, ...], *, gaps: bool, turned: bool = True) -> Mesh:
+    """Teeth with 3 mm of gum, also around teeth that are taken out where these leave gaps, in any pose unless told."""
     if jaw.face_labels is None:
         raise SystemExit("parts are cut from labelled jaws")
     wanted = np.isin(jaw.face_labels, teeth)
     around = jaw.face_labels != GUM if gaps else wanted
     distance, _, _ = jaw.mesh.submesh(around).closest(jaw.mesh.face_centres)
     part = jaw.mesh.submesh(wanted | ((jaw.face_labels == GUM) & (distance < 3.0)))
+    if not turned:
+        return part
     rng = np.random.default_rng(len(teeth))
     return part.transformed(Rigid3(Rotation.random(rng=rng).as_matrix(), rng.normal(0, 50, 3)))
 

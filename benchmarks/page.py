@@ -165,6 +165,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "mouth": ("The mouth", anatomy_sections.mouth),
     "measure": ("Arch dimensions", anatomy_sections.measured),
     "landmarks": ("Estimated landmarks", anatomy_sections.landmarks),
+    "orientation": ("Jaws in any pose", anatomy_sections.orientation),
     "populations": ("Phantom populations", anatomy_sections.populations),
     "mean_shape": ("Mean shape", anatomy_sections.mean_shape),
     "visibility": ("Visibility", handpiece_sections.visibility),

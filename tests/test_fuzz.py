@@ -17,6 +17,7 @@ FEWER = {
     **dict.fromkeys(("reconstruct", "evaluate", "measure", "simulate", "precision", "film"), 4),
     **dict.fromkeys(("box", "design", "live", "stitch", "stitch of a mesh", "stitch-eval", "visibility"), 2),
     **dict.fromkeys(("mean shape", "resume"), 2),
+    **dict.fromkeys(("photographs", "study of scanners", "study by a table"), 2),
     "rescale": 8,
     "study files": 5,
     **dict.fromkeys(("exchanged cameras", "strange files beside", "long names"), 2),

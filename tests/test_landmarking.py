@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cuspid.anatomy.landmarks.dimensions import arch_dimensions, needed_landmarks
 from cuspid.anatomy.landmarks.estimation import SIGMA_MM, estimate_landmarks, with_estimates
-from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, labels_of, missing
+from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, labels_of, missing, tip_direction
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.geometry import Rigid3
@@ -61,8 +61,17 @@ def test_the_dimensions_are_within_half_a_millimetre(phantom: Jaw):
 def test_the_uncertainties_cover_the_errors(phantom: Jaw):
     found = estimated(phantom)
     scaled = np.array([error / found[label].estimated_sigma_mm for label, error in errors_mm(phantom, found).items()])
-    assert 0.5 < np.sqrt(np.mean(scaled**2)) < 1.4
-    assert np.mean(np.abs(scaled) < 2) > 0.9
+    # They are those of real teeth, which err by more than a phantom's.
+    assert 0.25 < np.sqrt(np.mean(scaled**2)) < 1.0
+    assert np.mean(np.abs(scaled) < 2) > 0.95
+
+
+def test_tips_of_worn_cusps_are_their_outer_corners():
+    """On a molar in both directions, on the lingual side of a premolar across the arch; its buccal one is highest."""
+    for name, signs in (("mesiobuccal_cusp", (-1, 1)), ("distobuccal_cusp", (1, 1)), ("mesiolingual_cusp", (-1, -1))):
+        assert tuple(np.sign(tip_direction("molar", name))) == (*signs, 1)
+    assert tuple(np.sign(tip_direction("premolar", "lingual_cusp"))) == (0, -1, 1)
+    assert tuple(tip_direction("premolar", "buccal_cusp")) == (0, 0, 1)
 
 
 def test_cusps_and_edges_lie_on_the_surface_and_few_are_far(phantom: Jaw):

@@ -1,3 +1,7 @@
+import os
+import resource
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -183,3 +187,17 @@ def test_rays_go_no_farther_than_told(farthest: float) -> None:
     near = whole.distances < farthest
     np.testing.assert_array_equal(limited.faces, np.where(near, whole.faces, -1))
     np.testing.assert_array_equal(limited.distances, np.where(near, whole.distances, np.inf))
+
+
+def test_rays_without_memory_are_an_error_and_not_the_end_of_the_process() -> None:
+    mesh = sphere(10.0)
+    child = os.fork()
+    if child == 0:
+        held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (held + (4 << 20), resource.RLIM_INFINITY))
+        try:
+            mesh.cast(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
+        except MemoryError:
+            os._exit(7)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7

@@ -7,7 +7,7 @@ import pytest
 from builders import any_pose, joined, moved, sphere
 from cuspid import storage
 from cuspid.anatomy.jaw_files import load_jaw
-from cuspid.anatomy.orientation import check_scale, find_occlusal_frame, require_one_jaw
+from cuspid.anatomy.orientation import _anterior_of_part, check_scale, find_occlusal_frame, require_one_jaw
 from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
@@ -50,6 +50,34 @@ def test_a_quadrant_with_its_base_lies_crowns_up_and_is_doubted(seed: int):
     up = (found.occlusal_from_mesh @ any_pose(seed, 300)).rotation[2, 2]
     assert np.degrees(np.arccos(up)) < 12
     assert any("which way is up" in note for note in found.notes)
+
+
+def test_a_wide_jaw_that_no_whole_arch_fits_is_doubted_and_keeps_its_frame(monkeypatch: pytest.MonkeyPatch):
+    """Of a cast without its molars, say, only the front is doubtful."""
+    mesh = horseshoe(120, 40).mesh.transformed(any_pose(1, 300))
+    sure = find_occlusal_frame(mesh)
+    monkeypatch.setattr("cuspid.anatomy.orientation._ARCH_MISFIT_MM", 0.0)
+    found = find_occlusal_frame(mesh)
+    assert len(found.notes) == 1
+    assert sure.notes == ()
+    assert (found.occlusal_from_mesh @ sure.occlusal_from_mesh.inverse()).angle_deg < 1e-6
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_front_of_a_quadrant_is_where_its_crowns_are_narrow(side: int):
+    """On either side of the jaw, and from any direction in the plane; its mirror image has its front where it has."""
+    rng = np.random.default_rng(5)
+    x = rng.uniform(0, 1, 4000)
+    across, turn = np.stack([25 * x, -42 * x**2.3], 1), np.radians(rng.uniform(0, 360))
+    tangent = np.stack([np.full(4000, 25.0), -42 * 2.3 * x**1.3], 1)
+    aside = np.stack([-tangent[:, 1], tangent[:, 0]], 1) / np.linalg.norm(tangent, axis=1)[:, None]
+    crowns = across + aside * rng.uniform(-4, 4, (4000, 1))
+    edges = across + aside * rng.uniform(-4, 4, (4000, 1)) * x[:, None]
+    kept = rng.uniform(0, 1, 4000) < x  # edges are counted: of narrow crowns there is less
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    front = _anterior_of_part(crowns * [side, 1] @ rotation.T, edges[kept] * [side, 1] @ rotation.T)
+    off = np.degrees(np.arccos(front @ rotation[:, 1]))
+    assert off < 12
 
 
 def in_unit(mm_per_unit_read: float) -> Mesh:

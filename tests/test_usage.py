@@ -67,6 +67,11 @@ def test_what_is_typed_after_a_file_wins(tmp_path: Path) -> None:
         ('qualty = "fine"\n', "run has no option qualty; did you mean quality?"),
         ("xyzxyz = 1\n", "cuspid run --help-all lists its options"),
         ("quality fine\n", "it is no TOML"),
+        (f"quality = {'[' * 20_000}\n", "it is no TOML"),
+        ('quality = "fin"\n', "a.toml: quality is 'fin', which it cannot be; cuspid run --help-all"),
+        ('[stereo]\nspacing-px = "two"\n', "a.toml: stereo.spacing-px is 'two', which it cannot be"),
+        ("seed = [1, 2]\n", "a.toml: seed is [1, 2]"),
+        ('seed = "--help"\n', "a.toml: seed is '--help'"),
     ],
 )
 def test_settings_that_are_not_understood_are_refused(

@@ -15,18 +15,21 @@ import resource
 import shutil
 import signal
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
 import trimesh
 from PIL import Image
 
+import photo_scene
 from boards import photographs, scene, undistorted
 from builders import image_path, write_frames
 from cuspid import cli, storage
@@ -43,12 +46,14 @@ from cuspid.model.arch_curve import arch_curve
 from cuspid.model.board import Board
 from cuspid.model.facing import facing_outwards
 from cuspid.model.jaw import Jaw, Landmark
+from cuspid.model.mesh import Mesh
 from cuspid.model.rig import Rig
 from cuspid.motion.colmap import read_model
 from cuspid.pipeline import scan as pipeline
 from cuspid.pipeline.scan import RenderOptions, take_images
 from cuspid.runtime.errors import CuspidError
 from cuspid.runtime.image_files import image_size, read_fine, read_image
+from cuspid.studies.grid import Case, Work
 from cuspid.studies.scanners.files import find_files
 from cuspid.studies.scanners.specimen import load_specimen
 from report_folders import (
@@ -71,7 +76,9 @@ LONGEST_S = 10.0
 """Of work; waiting may take more on a busy machine."""
 LONGEST_WAIT_S = 60.0
 MOST_BYTES = 2 << 30
-_NOISE = re.compile(r"Traceback|Warning:|corrupt|libpng|\[ ?WARN|\[ERROR|OpenCV|Exception|glog|\*\*\*", re.IGNORECASE)
+_NOISE = re.compile(
+    r"Traceback|Warning:|corrupt|libpng|\[ ?WARN|\[ERROR|OpenCV[(:]|Exception|glog|\*\*\*", re.IGNORECASE
+)
 _OUT = "out"
 _SOURCES = Path(cli.__file__).parent.parent.parent
 """Results name no folder of this machine."""
@@ -311,6 +318,8 @@ FILM = ("--handpiece", "@handpiece.json", "--frames", "3", "--supersampling", "1
 SHORT = ("--points", "10", "--samples", "1", "--finalists", "1", "--evaluations", "4")
 SEARCH = ("--jaw", "@jaw.ply", "--teeth", str(TOOTH), *SHORT)
 MEASURED = ("--distance", "3", "4", "36", "22", "47.5")
+QUICK_STUDY = ("--samples", "1000", "--registration.samples", "1000", "--registration.search.anchors", "3")
+QUICK_STUDY += ("--registration.search.targets", "100", "--registration.search.candidates", "20", "--dry-run")
 SCAN = ("--frames", "2", "--length-mm", "0.8", "--supersampling", "1")
 
 
@@ -608,6 +617,90 @@ def _footage(folder: Path) -> None:
     (folder / "footage" / "times.csv").write_text("\n".join(["camera,frame,time", *rows]))
 
 
+SETTINGS = ("rig build", "simulate", "reconstruct", "evaluate", "study scanners", "rig design", "calibrate")
+_GIVEN = {"reconstruct": ("c",), "evaluate": ("m", "r"), "study scanners": ("f",)}
+_GIVEN |= {"rig design": ("b",), "calibrate": ("i",)}
+
+
+def _settings(folder: Path) -> None:
+    """All options of some verbs."""
+    for name in SETTINGS:
+        into = ("--out", "x", "--write-config", f"@{name.replace(' ', '-')}.toml")
+        verb(*name.split(), *_GIVEN.get(name, ()), *into)(folder)
+
+
+def _read_settings(folder: Path) -> None:
+    """Each as its verb does; what the first one says is written, too."""
+    for name in SETTINGS:
+        file = f"@{name.replace(' ', '-')}.toml"
+        verb(*name.split(), *_GIVEN.get(name, ()), "--config", file, "--write-config", f"@{_OUT}.toml")(folder)
+    verb("rig", "build", "--config", "@rig-build.toml", "--out", f"@{_OUT}")(folder)
+
+
+CALIBRATIONS = {
+    **dict.fromkeys(("rig_config.json", "transforms.json", "camchain.yaml", "camera_array.toml"), None),
+    **dict.fromkeys(("stereo.xml", "stereo.json", "stereo.yml"), "opencv"),
+    "stereoParams.json": "matlab",
+    "anipose.toml": "anipose",
+    "scene.xml": "metashape",
+    "ros": "ros",
+}
+"""Files of other programs, and the formats that their names do not tell."""
+
+
+def _other_calibrations(folder: Path) -> None:
+    storage.write_handpiece(folder / "handpiece.json", DESIGNS["two"]())
+    for name, kind in CALIBRATIONS.items():
+        to = () if kind is None else ("--to", kind)
+        verb("rig", "convert", "@handpiece.json", f"@{name}", *to)(folder)
+
+
+def _convert(folder: Path) -> None:
+    """Each into ours; after the last one that is refused, the others still are read."""
+    refused = None
+    for name in ("handpiece.json", *CALIBRATIONS):
+        try:
+            verb("rig", "convert", f"@{name}", f"@{_OUT}/{name.replace('.', '-')}.json", "--to", "handpiece")(folder)
+        except SystemExit as ended:
+            refused = ended
+    if refused is not None:
+        raise refused
+
+
+def _scanners(folder: Path) -> None:
+    """A small study: two scanners with a scan each, and a table of the same."""
+    mesh = arch(1.6).mesh
+    rng = np.random.default_rng(0)
+    storage.write_mesh(folder / "given" / "reference" / "m.stl", mesh)
+    rows = ["scanner,specimen,file,reference"]
+    for scanner in "AB":
+        scan = Mesh(mesh.vertices + rng.normal(0, 0.01, mesh.vertices.shape), mesh.faces)
+        storage.write_mesh(folder / "given" / scanner / "m" / "1.stl", scan)
+        rows.append(f"{scanner},m,{scanner}/m/1.stl,reference/m.stl")
+    (folder / "given" / "study.csv").write_text("\n".join(rows))
+
+
+def _study_scanners(given: str) -> Callable[[Path], None]:
+    """As far as the table of what would be compared, without processes of its own, which take seconds to start."""
+
+    def done(cases: Iterable[Case], work: Work, folder: Path, **_: object) -> tuple[()]:
+        for case in cases:
+            work(**case.parameters)
+        return ()
+
+    def use(folder: Path) -> None:
+        with patch("cuspid.studies.scanners.study.run_grid", done):
+            verb("study", "scanners", given, *QUICK_STUDY, "--out", f"@{_OUT}")(folder)
+
+    return use
+
+
+def _one_camera(folder: Path) -> None:
+    """Photographs of one camera with a board beside the object."""
+    images = photo_scene.scene(4).images.values()
+    write_frames(folder / "photos", [cv2.resize(each, (240, 180), interpolation=cv2.INTER_AREA) for each in images])
+
+
 def _stitched(folder: Path) -> None:
     write_stitched(folder / "panorama", stitched_panorama())
 
@@ -698,6 +791,14 @@ SCENARIOS: Mapping[str, Scenario] = {
         _footage,
         verb("import", "@footage", "--handpiece", "@handpiece.json", "--sync", "times", "--out", f"@{_OUT}"),
     ),
+    "settings": Scenario(_settings, _read_settings),
+    "convert": Scenario(_other_calibrations, _convert),
+    "study of scanners": Scenario(_scanners, _study_scanners("@given")),
+    "study by a table": Scenario(_scanners, _study_scanners("@given/study.csv")),
+    "photographs": Scenario(
+        _one_camera,
+        verb("reconstruct", "@photos", "--columns", "7", "--rows", "5", "--square-mm", "3", "--out", f"@{_OUT}"),
+    ),
     "stitch": Scenario(_film, verb("pano", "stitch", "@film/capture/images/camera", "--out", f"@{_OUT}")),
     "stitch of a mesh": Scenario(
         _arch, verb("pano", "stitch", "--mesh", "@jaw.ply", "--view.mm-per-px", "2", "--out", f"@{_OUT}")
@@ -725,6 +826,8 @@ def damaged(data: bytes, rng: np.random.Generator, suffix: str) -> bytes:
             ways += 4 * [_renumbered]
         if suffix == ".json":
             ways += 9 * [_revalued]
+        if suffix == ".toml":
+            ways += 9 * [_reset]
         data = ways[rng.integers(len(ways))](data, rng)
     return data
 
@@ -791,6 +894,22 @@ def _revalued(data: bytes, rng: np.random.Generator) -> bytes:
     else:
         holder[key] = VALUES[rng.integers(len(VALUES))]
     return json.dumps(value).encode()
+
+
+def _reset(data: bytes, rng: np.random.Generator) -> bytes:
+    """A line of a TOML file with another value or name, or twice."""
+    lines = data.decode(errors="surrogateescape").split("\n")
+    at = int(rng.integers(len(lines)))
+    name, _, value = lines[at].partition(" = ")
+    other = json.dumps(VALUES[rng.integers(len(VALUES))])
+    way = rng.random()
+    if way < 0.15:
+        lines.insert(at, lines[at])
+    elif way < 0.3:
+        lines[at] = f"{other} = {value}"
+    else:
+        lines[at] = f"{name} = {other}"
+    return "\n".join(lines).encode(errors="surrogateescape")
 
 
 def damage(folder: Path, rng: np.random.Generator) -> str:
@@ -868,6 +987,7 @@ def captured(into: Path) -> Iterator[None]:
 def wrong_with(use: Callable[[], object], said: Path) -> str | None:
     """What is wrong with how damaged input was taken; None where nothing is."""
     message, status = "", 0
+    warnings.filterwarnings("ignore", module="PIL")  # as the command line does, for what reads without it
     try:
         with captured(said), limited():
             try:

@@ -2,7 +2,8 @@
 
 The outside of a scan tells where the crowns point: an open surface by the mean of its normals, a closed model by its
 side that is not smooth. Seen from there the tips of the crowns give the occlusal plane, the symmetry of the crowns the
-midline, and their spread across it which end is anterior.
+midline, and their spread across it which end is anterior. Of a quadrant the anterior end is the one with the narrower
+crowns, and half of an arch, laid on them from there, tells where its front lies.
 
 Frames: ``occlusal`` as in :mod:`cuspid.model.jaw`: origin in the middle of the crowns at the mean height of their tips.
 """
@@ -41,6 +42,10 @@ _NARROW_MM = 32.0
 """What is narrower across is part of an arch."""
 _NARROW_ARCH_MM = 36.0
 """Crowns that are narrower across are those of a part of an arch; whole ones are 45 mm and more."""
+_EDGE_MM = 2.0
+"""So far below their tips, front teeth are edges and molars are broad."""
+_TURNS = tuple(np.deg2rad([-20.0, 0.0, 20.0]))
+"""Of half of an arch that is laid on a part of one, from where its ends lie like those of the part, radians."""
 _LEANS_DEG = (25.0, 50.0, 75.0)
 """How far from where a part of an arch seems to look its crowns are looked for."""
 _PART_NOTE = (
@@ -55,6 +60,8 @@ _ENOUGH_FACES = 500_000
 """More say no more of how a jaw lies."""
 _TILT_SD_DEG = 30.0
 """Standard deviation of what the outside of a scan, or the plane on which it rests, tells of its tilt."""
+_PART_TILT_SD_DEG = 15.0
+"""The same for a part of an arch, seen from where most of it is rough: its tips lie nearly on a line."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,6 +90,10 @@ class _Relief:
         rough = tops & self.rough()
         return np.asarray(self.points[rough if rough.any() else tops])
 
+    def edges(self) -> Float[np.ndarray, "n 3"]:
+        """Points of the crowns just below their tips."""
+        return np.asarray(self.points[crown_tops(self.points[..., 2], _GRID_MM, _EDGE_MM)])
+
     def rough(self) -> Bool[np.ndarray, "h w"]:
         """Where the normals of the surroundings point apart, which shortens their mean."""
         seen = np.isfinite(self.normals[..., 2])
@@ -107,11 +118,14 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     if len(crowns) == 0:
         note = "occlusal frame: unsure, as nothing looks like a crown; check the picture"
         return OcclusalFrame(occlusal_from_mesh=level, notes=(*notes, note))
-    anterior, whole = _anterior(crowns[:, :2])
-    if not whole:
-        relief, level = _level_frame(mesh, _roughest(mesh, start))
-        crowns, notes = relief.crowns(), (*notes, _PART_NOTE)
-        anterior, _ = _anterior(crowns[:, :2])
+    anterior, one_way = _anterior(crowns[:, :2])
+    wide = _width_mm(crowns[:, :2]) > _NARROW_ARCH_MM
+    if not (wide and one_way):
+        notes = (*notes, _PART_NOTE)
+    if not wide:
+        relief, level = _level_frame(mesh, _roughest(mesh, start), _PART_TILT_SD_DEG)
+        crowns = relief.crowns()
+        anterior = _anterior_of_part(crowns[:, :2], relief.edges()[:, :2])
     centre = np.array([*crowns[:, :2].mean(axis=0), relief.tips()[:, 2].mean()])
     turn = np.array([[anterior[1], -anterior[0], 0], [anterior[0], anterior[1], 0], [0, 0, 1.0]])
     return OcclusalFrame(occlusal_from_mesh=Rigid3(turn, -turn @ centre) @ level, notes=notes)
@@ -195,9 +209,9 @@ def _roughness(relief: _Relief) -> float:
     return float(np.arccos(np.clip(cosines[known], -1, 1)).mean()) if known.any() else 0.0
 
 
-def _level_frame(mesh: Mesh, start: Rigid3) -> tuple[_Relief, Rigid3]:
+def _level_frame(mesh: Mesh, start: Rigid3, tilt_sd_deg: float = _TILT_SD_DEG) -> tuple[_Relief, Rigid3]:
     """A frame turned so that the tips of the crowns lie in the plane XY on average, and what is seen from there."""
-    frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, _TILT_SD_DEG) @ start
+    frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, tilt_sd_deg) @ start
     return _relief(mesh, frame), frame
 
 
@@ -219,16 +233,36 @@ def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
 
 def _anterior(crowns: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], bool]:
     """Unit vector towards anterior, from the places of the crowns seen from above: how an arch fits them best. And
-    whether they are those of a whole arch, which fits one way only."""
+    whether it fits well, and one way only."""
     places = crowns[:: max(1, len(crowns) // 1000)]
     angles = np.deg2rad(np.arange(0, 360, 20.0))
-    fits = [_fit_arch(places, angle, *size_mm) for size_mm in _ARCHES_MM for angle in angles]
+    halves = np.linspace(-1, 1, 61)
+    fits = [_fit_arch(places, _arch(halves, *size_mm), angle) for size_mm in _ARCHES_MM for angle in angles]
     misfits = np.array([misfit for misfit, _ in fits])
     directions = np.array([direction for _, direction in fits])
     best = int(np.argmin(misfits))
     rivals = misfits[directions @ directions[best] < np.cos(np.deg2rad(60))]
     one_way = misfits[best] < _ARCH_MISFIT_MM and (len(rivals) == 0 or misfits[best] < 0.85 * rivals.min())
-    return _midline(places, directions[best]), bool(one_way and _width_mm(crowns) > _NARROW_ARCH_MM)
+    return _midline(places, directions[best]), bool(one_way)
+
+
+def _anterior_of_part(crowns: Float[np.ndarray, "n 2"], edges: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "2"]:
+    """Unit vector towards anterior from the places of the crowns of a part of an arch, and from those just below their
+    tips, seen from above."""
+    places = crowns[:: max(1, len(crowns) // 500)]
+    centre = places.mean(axis=0)
+    row = np.linalg.svd(places - centre, full_matrices=False)[2][0]
+    along = (places - centre) @ row
+    low, high = np.quantile(along, [0.02, 0.98])
+    ends = np.digitize((edges - centre) @ row, np.linspace(low, high, 4)[1:3])
+    front = row if np.sum(ends == 2) < np.sum(ends == 0) else -row
+    # The row bulges outwards: to the side that x is on where its front is +y.
+    outwards = np.array([front[1], -front[0]])
+    side = 1.0 if (places - centre) @ outwards @ (along**2 - np.mean(along**2)) < 0 else -1.0
+    arch = _arch(side * np.linspace(0, 1, 31), *_ARCHES_MM[0])
+    chord = arch[0] - arch[-1]
+    start = np.arctan2(front[1], front[0]) - np.arctan2(chord[1], chord[0])
+    return min((_fit_arch(places, arch, start + turn) for turn in _TURNS), key=lambda fit: fit[0])[1]
 
 
 def _midline(places: Float[np.ndarray, "n 2"], front: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
@@ -246,13 +280,16 @@ def _midline(places: Float[np.ndarray, "n 2"], front: Float[np.ndarray, "2"]) ->
     return np.array([np.cos(best), np.sin(best)])
 
 
+def _arch(across: Float[np.ndarray, "m"], half_width_mm: float, depth_mm: float) -> Float[np.ndarray, "m 2"]:
+    """Points of an arch whose front is +y, at fractions of half its width."""
+    return np.stack([half_width_mm * across, -depth_mm * np.abs(across) ** 2.3], axis=1)
+
+
 def _fit_arch(
-    places: Float[np.ndarray, "n 2"], angle: float, half_width_mm: float, depth_mm: float
+    places: Float[np.ndarray, "n 2"], arch: Float[np.ndarray, "m 2"], angle: float
 ) -> tuple[float, Float[np.ndarray, "2"]]:
     """Lay an arch on the crowns from a start ``angle``: misfit in mm (0 to 4), and where its front points."""
-    x = np.linspace(-1, 1, 61)
-    arch = np.stack([half_width_mm * x, -depth_mm * np.abs(x) ** 2.3], axis=1)
-    arch -= arch.mean(axis=0)
+    arch = arch - arch.mean(axis=0)
     c, s = np.cos(angle), np.sin(angle)
     laid = arch @ np.array([[c, s], [-s, c]]) + places.mean(axis=0)
     tree = cKDTree(places)
@@ -267,9 +304,9 @@ def _fit_arch(
     there, _ = cKDTree(laid).query(places)
     there = there[there <= np.quantile(there, _ON_ARCH)]
     back, _ = tree.query(laid)
-    front = laid[30] - laid[[0, -1]].mean(axis=0)
+    _, rotation, _ = best_similarity(arch, laid, np.ones(len(arch)))
     misfit = np.minimum(there, 4.0).mean() + np.minimum(back, 4.0).mean()
-    return float(misfit / 2), front / np.linalg.norm(front)
+    return float(misfit / 2), rotation[:, 1]
 
 
 def _apply_similarity(

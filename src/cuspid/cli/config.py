@@ -11,16 +11,20 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import is_dataclass
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import is_dataclass, make_dataclass
 from difflib import get_close_matches
 from inspect import signature
+from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
+import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.inputs import read_bytes
+from cuspid.runtime.inputs import read_text
+from cuspid.runtime.values import one_line, shown
 from cuspid.storage.files import write_bytes
 
 READ, WRITE = "--config", "--write-config"
@@ -63,7 +67,7 @@ def _options(name: str, hint: Any, path: tuple[str, ...], prefix: str, omitted: 
 def read_config(verb: str, command: Callable[..., object], given: Sequence[str]) -> list[str]:
     """Arguments with the contents of a file in the place of ``--config FILE``; what comes later wins.
 
-    Raises InputError for a file that is not TOML, or has an option that the verb lacks.
+    Raises InputError for a file that is not TOML, or has an option that the verb lacks, or a value that it cannot take.
     """
     arguments = list(given)
     while (at := next((k for k, each in enumerate(arguments) if each.split("=")[0] == READ), None)) is not None:
@@ -93,17 +97,34 @@ def _value(arguments: Sequence[str], at: int) -> tuple[str, int]:
 
 def _arguments(verb: str, options: Mapping[str, Option], file: Path) -> list[str]:
     try:
-        table = tomllib.loads(read_bytes(file, "text").decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: it is no TOML ({error})") from error
+        table = tomllib.loads(read_text(file))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file}: it is no TOML ({one_line(error)})") from error
     arguments: list[str] = []
     for name, value in _leaves(table):
         if name not in options:
             near = get_close_matches(name, options, n=1)
             meant = f"; did you mean {near[0]}?" if near else f"; cuspid {verb} --help-all lists its options"
-            raise InputError(f"{file}: {verb} has no option {name}{meant}")
+            raise InputError(f"{file}: {verb} has no option {one_line(name)}{meant}")
+        if not _is_taken(value, options[name].hint):
+            raise InputError(
+                f"{file}: {name} is {shown(value)}, which it cannot be; cuspid {verb} --help-all lists its options"
+            )
         arguments += _as_arguments(name, value, options[name].hint)
     return arguments
+
+
+def _is_taken(value: Any, hint: Any) -> bool:
+    """Whether the command line makes a value of this type of it."""
+    if hint is bool:
+        return isinstance(value, bool)
+    alone, silence = make_dataclass("alone", [("value", hint)]), StringIO()
+    try:
+        with redirect_stdout(silence), redirect_stderr(silence):
+            tyro.cli(alone, args=_as_arguments("value", value, hint))
+    except SystemExit:
+        return False
+    return True
 
 
 def _leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -23,10 +23,12 @@ from cuspid.runtime.workers import computed_once, map_slices
 
 _ROUNDING = 5e-7
 """Rounding of a length in single precision, relative: four steps."""
-
-
 _MOST_COLLAPSED = 500_000
 """Largest number of faces that edge collapse starts from."""
+
+
+_SCENE_BYTES, _BYTES_A_FACE = 64 << 20, 300
+"""What Embree needs for rays at a mesh, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +213,8 @@ class Mesh(Displayed):
 
     @computed_once
     def _scene(self) -> rtcore_scene.EmbreeScene:
+        # MemoryError, before Embree ends the process for want of it.
+        np.empty(_SCENE_BYTES + _BYTES_A_FACE * len(self.faces), np.uint8)
         scene = rtcore_scene.EmbreeScene()
         TriangleMesh(scene, self.vertices.astype(np.float32), self.faces.astype(np.int32))
         return scene

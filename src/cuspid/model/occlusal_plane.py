@@ -27,10 +27,12 @@ _ROUNDS = 4
 """The tips are looked for anew from where they lie level."""
 
 
-def crown_tops(heights: Float[np.ndarray, "h w"], spacing_mm: float) -> Bool[np.ndarray, "h w"]:
-    """Where the tops of the crowns are, within 3 mm of a tip; heights that are not known are NaN."""
+def crown_tops(
+    heights: Float[np.ndarray, "h w"], spacing_mm: float, below_mm: float = _CROWN_MM
+) -> Bool[np.ndarray, "h w"]:
+    """Where the tops of the crowns are, so far below a tip; heights that are not known are NaN."""
     summits = _summits(heights, spacing_mm, _TOOTH_MM)
-    return np.asarray((heights > summits - _CROWN_MM) & _on_plane(summits, heights))
+    return np.asarray((heights > summits - below_mm) & _on_plane(summits, heights))
 
 
 def crown_tips(

@@ -38,19 +38,16 @@ TOOTH_LANDMARKS: Mapping[ToothKind, tuple[str, ...]] = MappingProxyType(
 """Points of a tooth of each kind.
 
 ``*_angle``: corner of the incisal edge; on a canine, the shoulder where the edge meets the proximal side.
-``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: the point of the cusp that is highest along the tooth, on a
-molar in a direction that leans outwards by `TIP_LEAN_DEG`; of several lingual cusps of a premolar, the mesial one.
-``central_groove``: deepest point of the central groove or fossa below the plane of the cusps, within `PIT_REACH` of the
-middle. ``buccal_groove``: where the (mesio)buccal groove crosses the occlusal rim. ``*_cervix``: lowest (most apical)
-point of the gum's margin on that side.
+``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: the point of the cusp that is farthest in its `tip_direction`;
+of several lingual cusps of a premolar, the mesial one. ``central_groove``: deepest point of the central groove or fossa
+below the plane of the cusps, half-way between mesial and distal. ``buccal_groove``: where the (mesio)buccal groove
+crosses the occlusal rim. ``*_cervix``: lowest (most apical) point of the gum's margin on that side.
 """
 ANGLE_DEG: Mapping[ToothKind, float] = MappingProxyType({"incisor": 45.0, "canine": 60.0})
 """Direction in which the angle of an edge is the farthest point, from up to sideways; the edge of a canine slopes."""
-TIP_LEAN_DEG = 10.0
-"""Lean outwards, both along the arch and across it, of the direction in which the tip of a molar's cusp is the farthest
+_MOLAR_LEAN_DEG, _LINGUAL_LEAN_DEG = 10.0, 20.0
+"""Lean outwards of the direction in which the tip of a molar's cusp, or of a premolar's lingual one, is the farthest
 point: of a top that is worn flat, the corner where its ridges met."""
-PIT_REACH: Mapping[ToothKind, float] = MappingProxyType({"premolar": 0.0, "molar": 0.1})
-"""How far from the middle between mesial and distal a central groove is looked for, as a fraction of half the width."""
 
 MIDLINE_LANDMARKS = ("papilla", "midline")
 """``papilla``: centre of the incisive papilla (upper), tip of the lingual papilla between the central incisors (lower).
@@ -60,6 +57,19 @@ MIDLINE_LANDMARKS = ("papilla", "midline")
 def kind_of(fdi: int) -> ToothKind:
     """Kind of a permanent tooth by its FDI number."""
     return _KINDS[fdi % 10 - 1]
+
+
+def outwards(name: str) -> Float[np.ndarray, "2"]:
+    """Where a cusp lies from the middle of its tooth, as signs of u (distal) and v (buccal)."""
+    along = -1.0 if "mesio" in name else 1.0 if "dist" in name else 0.0
+    return np.array([along, 1.0 if "buccal" in name else -1.0])
+
+
+def tip_direction(kind: ToothKind, name: str) -> Float[np.ndarray, "3"]:
+    """Direction (u, v, z), not of length one, in which the tip of a cusp of a premolar or molar is the farthest point:
+    up along the tooth, for most of them a little outwards; see :func:`outwards`."""
+    lean = _MOLAR_LEAN_DEG if kind == "molar" else _LINGUAL_LEAN_DEG if "lingual" in name else 0.0
+    return np.array([*np.tan(np.radians(lean)) * outwards(name), 1.0])
 
 
 def labels_of(teeth: Iterable[int]) -> tuple[str, ...]:

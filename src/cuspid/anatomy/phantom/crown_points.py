@@ -1,10 +1,10 @@
 """The anatomical points of a crown, in the frame of the tooth (see `cuspid.anatomy.teeth.crowns`).
 
-A cusp tip is the point farthest along the long axis, on a molar in a direction that leans outwards a little; the angle
-of an incisal edge, the point farthest in a direction half-way between edge and side. The rim of a molar is taken at
+A cusp tip is the point farthest along the long axis, or in a direction that leans outwards a little; the angle of an
+incisal edge, the point farthest in a direction half-way between edge and side. The rim of a molar is taken at
 `RIM`, where its profile turns from the occlusal surface to the side; the buccal groove crosses it at the lowest point
-between the two mesial buccal cusps. The central groove is taken where it is deepest below the plane of the cusps: of a
-molar, at its central pit; of a premolar, whose pits lie to either side, half-way between mesial and distal.
+between the two mesial buccal cusps. The central groove is taken where it is deepest below the plane of the cusps,
+half-way between mesial and distal.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.anatomy.landmarks.scheme import ANGLE_DEG, PIT_REACH, TIP_LEAN_DEG, TOOTH_LANDMARKS, ToothKind, below_cusps
+from cuspid.anatomy.landmarks.scheme import ANGLE_DEG, TOOTH_LANDMARKS, ToothKind, below_cusps, tip_direction
 from cuspid.anatomy.teeth.crowns import Crown, Lobe, Values, crown_distance
 
 Point = Float[np.ndarray, "3"]
@@ -55,7 +55,7 @@ def crown_point(crown: Crown, kind: ToothKind, name: str) -> Point:
 def _goal(crown: Crown, kind: ToothKind, name: str) -> _Goal:
     """What a landmark is."""
     if name == "central_groove":
-        return _deepest(crown, PIT_REACH[kind])
+        return _deepest(crown)
     if name == "buccal_groove":
         return _crossing(crown)
     return _edge_point(crown, kind, name) if crown.edge else _tip(crown, kind, name)
@@ -74,11 +74,8 @@ def _edge_point(crown: Crown, kind: ToothKind, name: str) -> _Goal:
 
 def _tip(crown: Crown, kind: ToothKind, name: str) -> _Goal:
     """The tip of a cusp by its name: the mesial or distal one of its side."""
-    along, across = -1 if name.startswith("mesio") else 1, 1 if "buccal" in name else -1
-    cusp = _row(crown, across)[1 if name.startswith("disto") else 0]
-    lean = np.tan(np.radians(TIP_LEAN_DEG)) if kind == "molar" else 0.0
-    towards = UP + lean * np.array([along, across, 0.0])
-    return _Goal(start=_foot(crown, cusp), reach=np.full(2, 0.6), towards=towards)
+    cusp = _row(crown, 1 if "buccal" in name else -1)[1 if name.startswith("disto") else 0]
+    return _Goal(start=_foot(crown, cusp), reach=np.full(2, 0.6), towards=tip_direction(kind, name))
 
 
 def _foot(crown: Crown, cusp: Lobe) -> Float[np.ndarray, "2"]:
@@ -98,12 +95,12 @@ def _crossing(crown: Crown) -> _Goal:
     return _Goal(start=start, reach=np.array([0.3 * (distal - mesial), 0.0]), towards=-UP)
 
 
-def _deepest(crown: Crown, wide: float) -> _Goal:
-    """The deepest point between buccal and lingual cusps, within a fraction of half the width about the middle."""
+def _deepest(crown: Crown) -> _Goal:
+    """The deepest point between buccal and lingual cusps, half-way between mesial and distal."""
     rows = [np.array([_foot(crown, cusp) for cusp in cusps]) for cusps in (_row(crown, 1)[:2], _row(crown, -1))]
     buccal, lingual = (np.column_stack([row, heights(crown, row)]) for row in rows)
     low, high = lingual[:, 1].max(), buccal[:, 1].min()
-    reach = np.array([wide * crown.half_width_mm, 0.4 * (high - low)])
+    reach = np.array([0.0, 0.4 * (high - low)])
     return _Goal(start=np.array([0.0, (low + high) / 2]), reach=reach, towards=below_cusps(buccal, lingual))
 
 
