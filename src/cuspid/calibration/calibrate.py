@@ -57,8 +57,8 @@ _MUCH_MORE = 3.0
 _LESS = 0.9
 """Residuals in views that a calibration was not made from, as a share of those if all cameras exposed together, below
 which they did not; and the share of the views that must then remain."""
-_ROLLING = 4.0
-"""How far readouts of 0 must be from the best ones, in standard deviations by the corners, for these to be tried."""
+_ROLLING = 3.0
+"""How far readouts of 0 must be from the best ones, in standard deviations, for these to be tried."""
 _RUN = 6
 """Number of successive instants that stay in the same half, where cameras do not expose together."""
 _ODD_SIZE = 0.02

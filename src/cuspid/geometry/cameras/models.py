@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from numpy.polynomial import Polynomial
 
 
 @dataclass(frozen=True)
@@ -53,12 +52,17 @@ _NOTHING = 1e-12
 def fold_radius(model: LensModel, distortion: Float[np.ndarray, "k"]) -> float:
     """Ideal radius up to which the distorted one grows with it: from there on the model folds the image back onto
     itself, and means nothing. Infinite for a perspective lens that never folds; at most pi for an equidistant one."""
-    numerator = Polynomial([1.0, *distortion[list(model.numerator)]])  # of r^2
-    denominator = Polynomial([1.0, *distortion[list(model.denominator)]])
-    square = Polynomial([0.0, 1.0])
-    # d(r N / D) / dr = (D (N + 2 r^2 N') - 2 r^2 N D') / D^2
-    slope = denominator * (numerator + 2 * square * numerator.deriv()) - 2 * square * numerator * denominator.deriv()
-    roots = np.concatenate([each.trim(_NOTHING).roots() for each in (slope, denominator)])
+    # d(r N / D) / dr = (D (N + 2 r^2 N') - 2 r^2 N D') / D^2, with N and D by powers of r^2
+    numerator, denominator = (np.array([1.0, *distortion[list(each)]]) for each in (model.numerator, model.denominator))
+    odd, even = 1 + 2 * np.arange(len(numerator)), 2 * np.arange(len(denominator))
+    slope = np.convolve(denominator, odd * numerator) - np.convolve(numerator, even * denominator)
+    roots = np.concatenate([np.roots(_shortened(each)[::-1]) for each in (slope, denominator)])
     real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
     first = float(np.sqrt(real.min())) if len(real) else np.inf
     return min(first, np.pi) if model.is_equidistant else first
+
+
+def _shortened(coefficients: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
+    """Without the highest ones where they are nothing."""
+    some = np.flatnonzero(np.abs(coefficients) > _NOTHING)
+    return coefficients[: some[-1] + 1]
