@@ -55,6 +55,8 @@ _LENSES, _CAMERAS, _BOARDS, _BENDINGS, _SHAPES, _MOUNTS, _CAMERA_DELAYS, _READOU
 _RADIAL_SIGMA, _SIDEWAYS_SIGMA = 0.5, 0.01
 """Standard deviation of radial, and of tangential and prism parameters about 0, for lenses as they are made: it matters
 only where the images do not decide. Radial terms beyond the second may do as much at the corner of the image."""
+_CONTROL_PX = 2.0
+"""Standard deviation of what a control point of a splined lens shifts places by."""
 _CENTRE_SHARE = 0.05
 """Standard deviation of the principal point about the image centre, as a share of the image width."""
 _BENDING_SHARE = 0.01
@@ -500,6 +502,9 @@ class _Free:
         if only_boards:
             free = np.isin(kind, (_BOARDS, _VIEW_DELAYS))
         free[lenses : lenses + _PLACE] = False
+        for k, camera in enumerate(scene.cameras.values()):
+            if camera.lens.splined:
+                free[_numbers(scene) * k + camera.parameter_names.index("reach")] = False
         if board.terraces > 1:
             free[np.flatnonzero(kind == _BENDINGS)[1:]] = False
         if scene.timing is not None:
@@ -724,6 +729,8 @@ def _lens_precision(camera: Camera, numbers: int) -> Float[np.ndarray, "n"]:
     for terms in (camera.lens.numerator, camera.lens.denominator):
         for order, place in enumerate(terms):
             sigma[place] = _RADIAL_SIGMA / corner ** (2 * max(order - 1, 0))
+    if camera.lens.splined:
+        sigma[-2 * camera.lens.splined**2 :] = _CONTROL_PX / camera.focal_px.mean()
     known = np.concatenate([[0.0, 0.0], centre**-2.0, sigma**-2.0])
     return np.pad(known, (0, numbers - len(known)), constant_values=1.0)
 

@@ -72,8 +72,9 @@ class CalibrationOptions(Options):
     """The model of the lenses, and which views are left out."""
 
     lens: LensName = "auto"
-    """COLMAP's name of the model of the lenses. auto: for each camera the simplest one that no richer one beats, by
-    more than chance, in views that it was not made from."""
+    """COLMAP's name of the model of the lenses, or splined: a fisheye with a grid of shifts, for what no polynomial
+    follows. auto: for each camera the simplest one that no richer one beats, by more than chance, in views that it was
+    not made from."""
     shutter: Literal["auto", "global"] = "auto"
     """auto: where a filmed board moves, it is estimated how long after the first row of an image the last one is
     exposed, and kept if that explains images that it was not estimated from. global: all rows are exposed at once."""

@@ -177,7 +177,7 @@ def _matrix(values, places, starts, first, unknowns, between, follow, most, out)
         for n in range(starts[view], starts[view + 1]):
             used = 0
             for a in range(places.shape[1]):
-                if places[n, a] >= 0:
+                if places[n, a] >= 0 and (values[n, 0, a] != 0 or values[n, 1, a] != 0):
                     place[used], one[used], other[used] = places[n, a], values[n, 0, a], values[n, 1, a]
                     used += 1
             for a in range(used):
