@@ -331,6 +331,7 @@ def calibrated_half(
     model = next(iter(models.values()))
     if len(set(models.values())) > 1:
         model = "auto"
+    model = "splined" if model == "SPLINED_FISHEYE" else model
     try:
         found = calibrate_rig(views, sizes, board, CalibrationOptions(lens=model))  # type: ignore[arg-type]
     except ReconstructionError:

@@ -13,8 +13,8 @@ from cuspid.calibration.board_shape import BoardShape
 from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
-from cuspid.calibration.start import board_pose, first_camera
-from cuspid.calibration.timing import rolling, untied
+from cuspid.calibration.start import board_pose, first_camera, renumbered
+from cuspid.calibration.timing import adjust_scene, rolling, untied
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
 from cuspid.model.camera import Camera
@@ -27,7 +27,7 @@ CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)
 
 
 def calibrated(truth: BoardScene, views: dict, board: Board = BOARD) -> RigCalibration:
-    return calibrate_rig(views, dict.fromkeys(truth.cameras, SIZE), board)
+    return calibrate_rig(views, dict.fromkeys(truth.cameras, SIZE), board, CalibrationOptions(lens="OPENCV"))
 
 
 def lens_error(found: RigCalibration, truth: BoardScene, name: str) -> float:
@@ -130,8 +130,9 @@ def test_jacobian_agrees_with_finite_differences(exposure):
     even = BoardShape.even(BOARD)
     truth = replace(truth, shape=even.moved(np.random.default_rng(2).normal(0, 0.05, even.offsets_mm.size)))
     seen = bundle._Observations.of(views, BOARD, truth)
-    free = bundle._Free.of(truth, BOARD, only_boards=False)
-    jacobian = bundle._jacobian(truth, seen, bundle._project(truth, seen).in_cam)[:, free.columns].toarray()
+    free = bundle._Free.of(truth, seen, BOARD, only_boards=False)
+    values = bundle._derivatives(truth, seen, bundle._project(truth, seen).in_cam)
+    jacobian = np.concatenate([free.layout.rows_of(view, values) for view in range(len(seen.keys))])
     for column in range(len(free.columns)):
         step = np.zeros(len(free.columns))
         step[column] = 1e-6
@@ -209,6 +210,28 @@ def test_a_chessboard_is_numbered_alike_in_all_cameras():
     found = calibrated(truth, turned, CHESS)
     assert found.sigma_px < 0.06
     assert all(np.linalg.norm(between(found, truth, name).translation) < 0.05 for name in truth.cameras)
+
+
+@pytest.mark.parametrize("filmed", [False, True])
+def test_an_instant_that_is_numbered_otherwise_is_found_before_an_uneven_board(filmed):
+    """Its corners, rotated by half a turn, are those of another place of the board as it was given."""
+    truth = replace(scene(4, CHESS, cameras=2, instants=8), bending_mm=np.zeros(3))
+    off_mm = np.random.default_rng(1).normal(0, 0.02, (len(CHESS.corners), 3))
+    uneven = replace(truth, shape=replace(BoardShape.even(CHESS), offsets_mm=off_mm))
+    seen = bundle._Observations.of(views_of(truth, CHESS, 0.02, np.random.default_rng(0)), CHESS, uneven)
+    pixels = np.split(seen.pixels - bundle._project(uneven, seen).raw, seen.starts[1:-1])
+    views = {key: BoardView(np.arange(49), each) for key, each in zip(seen.keys, pixels, strict=True)}
+    order = CHESS.orders[2]
+    turned = {key: view.renumbered(order) if key[1] == "05" else view for key, view in views.items()}
+    about = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.array([*CHESS.size_mm, 0.0]))
+    poses = {**uneven.rig_from_board, "05": uneven.rig_from_board["05"] @ about}
+    start = replace(uneven, rig_from_board=poses)
+    start = untied(start, frame_numbers(poses), turned) if filmed else start
+    found = renumbered(adjust_scene(start, turned, CHESS, only_boards=True), turned, CHESS)
+    assert found is not None
+    assert all(np.array_equal(view.corner, views[key].corner) for key, view in found[1].items())
+    assert np.allclose(found[0].rig_from_board["05"].matrix, uneven.rig_from_board["05"].matrix, atol=0.01)
+    assert renumbered(adjust_scene(uneven, views, CHESS, only_boards=True), views, CHESS) is None
 
 
 @pytest.mark.long

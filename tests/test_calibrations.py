@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from cuspid import storage
 from cuspid.geometry import Rigid3
+from cuspid.geometry.cameras import GRID
 from cuspid.model.camera import Camera
 from cuspid.model.rig import MountedCamera, Rig
 from cuspid.runtime.errors import CuspidError, InputError, OutputError
@@ -638,9 +639,32 @@ def test_a_lens_that_cannot_be_carried_over_is_refused(tmp_path: Path, capsys: p
     line = refused(capsys, "rig", "convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab")
     assert "px off over the image" in line
     assert "--most-px" in line
+
     assert not (tmp_path / "m.json").exists()
     run("rig", "convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab", "--most-px", "2000")
     assert (tmp_path / "m.json").exists()
+
+
+def test_a_splined_lens_is_kept_by_handpieces_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shifts = np.random.default_rng(0).normal(0, 5 / 240, 2 * GRID**2)
+    camera = Camera(
+        width=640,
+        height=480,
+        focal_px=np.array([240.0, 240.0]),
+        principal_point_px=np.array([320.0, 240.0]),
+        distortion=np.array([0.0, 0, 0, 0, 1.4, *shifts]),
+        model="SPLINED_FISHEYE",
+    )
+    rig = Rig({"a": MountedCamera(camera, Rigid3.identity())})
+    assert carried_over(rig, "handpiece").rig["a"].camera is camera
+    write_calibration(tmp_path / "handpiece.json", rig, "handpiece", 10.0)
+    for kind in ("colmap-rig", "opencv", "kalibr"):
+        lost = carried_over(rig, kind).losses["a"]
+        assert 2 < lost.rms_px < lost.largest_px < 20
+        target = tmp_path / f"x{SUFFIXES.get(kind, '.json')}"
+        line = refused(capsys, "rig", "convert", tmp_path / "handpiece.json", target, "--to", kind)
+        assert "SPLINED_FISHEYE as" in line
+        assert "px off over the image" in line
 
 
 def test_metres_are_noticed(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cuspid.geometry import Rigid3
-from cuspid.geometry.cameras import LENSES, MODELS, fold_radius, projection_derivatives
+from cuspid.geometry.cameras import GRID, LENSES, MODELS, fold_radius, projection_derivatives
 from cuspid.model.camera import Camera, undistortion_maps
 from cuspid.model.rig import MountedCamera, Rig
 from cuspid.runtime.errors import InputError
@@ -38,7 +38,7 @@ def test_agrees_with_colmap(model: str, data: st.DataObject) -> None:
     np.testing.assert_allclose(camera.project(points), theirs.img_from_cam(points), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("model", MODELS)
 @given(data=st.data())
 @settings(max_examples=25)
 def test_rays_invert_the_projection(model: str, data: st.DataObject) -> None:
@@ -52,7 +52,7 @@ def test_rays_invert_the_projection(model: str, data: st.DataObject) -> None:
     np.testing.assert_allclose(camera.rays(pixels[inside]), points[inside] / points[inside, 2:], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("model", MODELS)
 @given(data=st.data())
 @settings(max_examples=10)
 def test_derivatives_are_those_of_differences(model: str, data: st.DataObject) -> None:
@@ -114,11 +114,11 @@ def test_where_a_model_folds_back(model: str, lens: list[float], radius: float) 
     assert fold_radius(MODELS[model], np.array(lens)) == pytest.approx(radius)
 
 
-@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("model", MODELS)
 def test_what_is_folded_back_is_not_shown(model: str) -> None:
     """Far from the axis it would be seen in the middle of the image."""
-    names = MODELS[model].names
-    lens = np.where(np.array(names) == "k1", -0.4, 0.0)
+    names = np.array(MODELS[model].names)
+    lens = np.where(names == "k1", -0.4, 0.0) + (names == "reach")
     camera = replace(Camera.from_field_of_view(400, 400, 60.0), model=model, distortion=lens)
     angles = np.linspace(0, 1.5, 400)
     pixels = camera.project(np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1))
@@ -136,6 +136,32 @@ def test_a_lens_is_of_a_known_model_with_its_parameters() -> None:
         replace(camera, model="BROWN")
     with pytest.raises(InputError, match="k1, k2, p1, p2, k3"):
         replace(camera, model="FULL_OPENCV", distortion=np.zeros(5))
+    with pytest.raises(InputError, match="k4, reach and 11 x 11 control points of x, then of y, not 5 numbers"):
+        replace(camera, model="SPLINED_FISHEYE", distortion=np.zeros(5))
+    with pytest.raises(InputError, match="reach of its grid must be positive, not 0"):
+        replace(camera, model="SPLINED_FISHEYE", distortion=np.zeros(len(MODELS["SPLINED_FISHEYE"].names)))
+
+
+@given(camera=lenses("SPLINED_FISHEYE"), at=st.tuples(st.integers(0, GRID - 1), st.integers(0, GRID - 1)))
+@settings(max_examples=25)
+def test_a_splined_lens_is_its_base_but_where_a_control_point_shifts_it(camera: Camera, at: tuple[int, int]) -> None:
+    """By as much as a cubic B-spline does, within two control points of it."""
+    base = replace(camera, model="OPENCV_FISHEYE", distortion=camera.distortion[:4])
+    straight = np.concatenate([camera.distortion[:5], np.zeros(2 * GRID**2)])
+    points = in_view(camera, 3, 80)
+    assert np.array_equal(replace(camera, distortion=straight).project(points), base.project(points), equal_nan=True)
+    bump, (row, column) = straight.copy(), at
+    bump[5 + GRID**2 + row * GRID + column] = 0.01
+    step = 2 * camera.distortion[4] / (GRID - 3)
+    middle = (np.array([column, row]) - (GRID - 1) / 2) * step
+    places = middle + step * np.array([[0.0, 0.0], [1, 0], [1, -1], [2.01, 0], [0, -2.01]])
+    angles = np.linalg.norm(places, axis=1, keepdims=True)
+    rays = np.hstack([places * np.sinc(angles / np.pi), np.cos(angles)])
+    shift = replace(camera, distortion=bump).project(rays) - base.project(rays)
+    expected = 0.01 * camera.focal_px[1] * np.array([4 / 9, 1 / 9, 1 / 36, 0, 0])
+    shown = np.isfinite(shift[:, 0])
+    np.testing.assert_allclose(shift[shown, 1], expected[shown], atol=1e-9)
+    np.testing.assert_allclose(shift[shown, 0], 0, atol=1e-9)
 
 
 def test_wide_lenses_are_straightened_into_a_given_pinhole() -> None:
@@ -151,7 +177,7 @@ def test_wide_lenses_are_straightened_into_a_given_pinhole() -> None:
 
 
 def test_the_limits_of_the_lenses_cover_every_parameter() -> None:
-    assert {name for model in MODELS.values() for name in model.names} == set(LENS_LIMITS)
+    assert {name for model in LENSES for name in MODELS[model].names} == set(LENS_LIMITS)
 
 
 def test_a_lens_that_folds_within_its_image_is_used_where_it_shows_something() -> None:

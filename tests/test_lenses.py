@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from boards import BOARD, LENSES_OF, SIZE, before_lens, views_of
-from cuspid.calibration.bundle import mounted_cameras
+from cuspid.calibration.bundle import BoardScene, mounted_cameras
 from cuspid.calibration.calibrate import calibrate_rig
-from cuspid.calibration.lenses import as_model, choose_lens
+from cuspid.calibration.lenses import as_model, choose_lens, with_spline
+from cuspid.calibration.uncertainty import lens_difference_px, projection_sigma_px
 from cuspid.geometry import Rigid3
+from cuspid.geometry.cameras import GRID
 from cuspid.model.camera import Camera
 from cuspid.runtime.errors import ReconstructionError
 
@@ -34,6 +36,42 @@ def test_the_model_of_a_lens_is_found(model: str) -> None:
     assert choice.held_out_px[model] <= 1.05 * min(choice.held_out_px.values())
     assert 0.2 < error_sigmas(mounted_cameras(alone)[""].camera, truth.cameras["cam"]) < 2
     assert f"{model} 0." in choice.summary
+
+
+def bumpy(instants: int) -> BoardScene:
+    """A fisheye with a pattern of shifts of about a pixel, which no polynomial has."""
+    truth = before_lens("OPENCV_FISHEYE", 1, instants=instants)
+    border = np.array([[10.0, 10], [630, 10], [630, 470], [10, 470]])
+    camera = with_spline(truth.cameras["cam"], border)
+    shifts = np.random.default_rng(1).normal(0, 1 / 300, 2 * GRID**2)
+    return replace(truth, cameras={"cam": replace(camera, distortion=np.concatenate([camera.distortion[:5], shifts]))})
+
+
+@pytest.mark.long
+def test_a_lens_that_no_polynomial_follows_is_splined_and_as_uncertain_as_stated() -> None:
+    """Over the image, but for a turn of the camera; and halves of the views are as far apart as both state."""
+    truth = bumpy(16)
+    views = views_of(truth, BOARD, 0.1, np.random.default_rng(1))
+    found = calibrate_rig(views, {"cam": SIZE}, BOARD)
+    held_out = found.lenses["cam"].held_out_px
+    assert found.lenses["cam"].model == "SPLINED_FISHEYE"
+    assert 0.1 < held_out["SPLINED_FISHEYE"] < 0.6 * held_out["OPENCV_FISHEYE"]
+    off = lens_difference_px(found.rig["cam"].camera, truth.cameras["cam"], found.pixels["cam"])
+    in_sigmas = np.linalg.norm(off, axis=2) / projection_sigma_px(found.rig["cam"].camera) / np.sqrt(2)
+    assert 0.5 < np.sqrt(np.nanmean(in_sigmas**2)) < 1.4
+    assert 0.5 < found.cameras["cam"].parameters_apart < 1.3
+
+
+def test_a_splined_lens_that_is_asked_for_is_its_base_where_nothing_was_seen() -> None:
+    truth = before_lens("OPENCV_FISHEYE", 1, instants=8)
+    views = list(views_of(truth, BOARD, 0.1, np.random.default_rng(1)).values())
+    left = [replace(view, corner=view.corner[own], pixels=view.pixels[own]) for view in views
+            if (own := view.pixels[:, 0] < 300).sum() > 12]  # fmt: skip
+    asked, alone = choose_lens(left, BOARD, SIZE, "splined")
+    camera = alone.scene.cameras[""]
+    assert (asked.model, camera.model) == ("SPLINED_FISHEYE", "SPLINED_FISHEYE")
+    shifts = np.abs(camera.distortion[5:].reshape(2, GRID, GRID)) * 300
+    assert shifts[:, :, -3:].max() < 1e-3 < shifts[:, 3:-3, 2:6].max() < 2
 
 
 def test_a_few_views_tell_no_model() -> None:

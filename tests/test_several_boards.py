@@ -111,8 +111,10 @@ def test_jacobian_by_the_places_of_boards() -> None:
     truth = on_a_body(0, cameras=2, instants=3)
     truth = replace(truth, bending_mm=np.linspace(-0.05, 0.05, 9))
     views = seen_by(truth, 1.0)
-    seen, free = bundle._Observations.of(views, SET, truth), bundle._Free.of(truth, SET, only_boards=False)
-    jacobian = bundle._jacobian(truth, seen, bundle._project(truth, seen).in_cam)[:, free.columns].toarray()
+    seen = bundle._Observations.of(views, SET, truth)
+    free = bundle._Free.of(truth, seen, SET, only_boards=False)
+    values = bundle._derivatives(truth, seen, bundle._project(truth, seen).in_cam)
+    jacobian = np.concatenate([free.layout.rows_of(view, values) for view in range(len(seen.keys))])
     for column in range(len(free.columns)):
         step = np.zeros(len(free.columns))
         step[column] = 1e-6

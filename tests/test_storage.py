@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from builders import CAMERA, box_mesh, handpiece, image_path, make_capture, rig_of, shifted
 from cuspid import storage
 from cuspid.geometry import Rigid3
-from cuspid.geometry.cameras import LENSES
+from cuspid.geometry.cameras import MODELS
 from cuspid.model.body import Body, Box
 from cuspid.model.capture import Dropped
 from cuspid.model.jaw import Jaw, Landmark, Sphere
@@ -141,8 +141,8 @@ def test_polarised_lights_return_and_plain_ones_are_written_as_before(tmp_path):
     assert storage.read_handpiece(file).lights["led"].glare == 1
 
 
-@given(camera=st.sampled_from(LENSES).flatmap(lenses), transform=rigid3s(), other=rigid3s())
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40, deadline=None)
+@given(camera=st.sampled_from([*MODELS]).flatmap(lenses), transform=rigid3s(), other=rigid3s())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25, deadline=None)
 def test_handpiece_and_rig_config_return(tmp_path, camera, transform, other):
     camera = dataclasses.replace(camera, covariance=1e-3 * np.eye(len(camera.parameters)))
     rig = Rig({"o1": MountedCamera(camera, transform, 1e-4 * np.eye(6)), "o2": MountedCamera(camera, other)})

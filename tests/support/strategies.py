@@ -47,9 +47,20 @@ def lenses(draw: st.DrawFn, model: str) -> Camera:
         height=draw(st.integers(64, 800)),
         focal_px=draw(hnp.arrays(np.float64, 2, elements=st.floats(300, 900))),
         principal_point_px=draw(hnp.arrays(np.float64, 2, elements=st.floats(100, 400))),
-        distortion=np.array([draw(st.floats(-LENS_LIMITS[name], LENS_LIMITS[name])) for name in MODELS[model].names]),
+        distortion=draw(distortions(model)),
         model=model,
     )
+
+
+@st.composite
+def distortions(draw: st.DrawFn, model: str) -> np.ndarray:
+    """Of a splined lens, with control points that shift places by a pixel or so."""
+    lens = MODELS[model]
+    known = [draw(st.floats(-LENS_LIMITS[name], LENS_LIMITS[name])) for name in lens.names if name in LENS_LIMITS]
+    if not lens.splined:
+        return np.array(known)
+    shifts = np.random.default_rng(draw(st.integers(0, 99))).normal(0, 1 / 500, 2 * lens.splined**2)
+    return np.array([*known, draw(st.floats(0.3, 1.5)), *shifts])
 
 
 def cameras() -> st.SearchStrategy[Camera]:

@@ -23,15 +23,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
 
 from cuspid.calibration.board_shape import BoardShape, nodes_of
 from cuspid.calibration.corners import BoardView, Views
+from cuspid.calibration.equations import (
+    Layout,
+    between_motions,
+    gradient_of,
+    matrix_of,
+    motion_equations,
+    without_motions,
+)
 from cuspid.calibration.scatter import covariance_of, influences
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board, Target
@@ -46,6 +55,8 @@ _LENSES, _CAMERAS, _BOARDS, _BENDINGS, _SHAPES, _MOUNTS, _CAMERA_DELAYS, _READOU
 _RADIAL_SIGMA, _SIDEWAYS_SIGMA = 0.5, 0.01
 """Standard deviation of radial, and of tangential and prism parameters about 0, for lenses as they are made: it matters
 only where the images do not decide. Radial terms beyond the second may do as much at the corner of the image."""
+_CONTROL_PX = 2.0
+"""Standard deviation of what a control point of a splined lens shifts places by."""
 _CENTRE_SHARE = 0.05
 """Standard deviation of the principal point about the image centre, as a share of the image width."""
 _BENDING_SHARE = 0.01
@@ -162,13 +173,27 @@ class Adjusted:
     """Standard deviation of one coordinate of a corner, besides what the board was elsewhere by in its view."""
     residuals: Mapping[tuple[str, str], Float[np.ndarray, "n 2"]]
     """Observed minus projected, px, by camera and instant."""
-    covariance: Float[np.ndarray, "k k"]
-    """Covariance of the cameras, if the corners err independently: the parameters of each in order, then the motion of
-    each, then their readouts, where there are any."""
-    moved: Float[np.ndarray, "i k"]
-    """By how much each instant moves these (:mod:`cuspid.calibration.scatter`)."""
     settled: bool
     """Whether the search for the minimum converged."""
+    equations: _Equations | None
+    """From which the covariance follows; None where the cameras were held."""
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "k k"]:
+        """Covariance of the cameras, if the corners err independently: the parameters of each in order, then the motion
+        of each, then their readouts, where there are any."""
+        return self._uncertainty[0]
+
+    @property
+    def moved(self) -> Float[np.ndarray, "i k"]:
+        """By how much each instant moves these (:mod:`cuspid.calibration.scatter`)."""
+        return self._uncertainty[1]
+
+    @cached_property
+    def _uncertainty(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "i k"]]:
+        if self.equations is None:
+            return np.zeros((0, 0)), np.zeros((0, 0))
+        return _camera_covariance(self.scene, self.equations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +323,9 @@ class _Projection:
     raw: Float[np.ndarray, "n 2"]
     """Residuals, px; NaN behind a camera."""
     by_view: Float[np.ndarray, "n 2 6"] | None
-    """Derivatives by a motion of the board in each view, where the scene is loose."""
+    """Derivatives by a motion of the board in each view, where the scene is loose, and"""
+    of_motions: tuple[Float[np.ndarray, "v 6 6"], Float[np.ndarray, "v 6"]] | None
+    """the normal equations of these motions, each corner with the weight 1."""
 
     @property
     def is_whole(self) -> bool:
@@ -314,8 +341,10 @@ def _project(scene: BoardScene, seen: _Observations) -> _Projection:
     for number, camera in enumerate(scene.cameras.values()):
         image[seen.camera == number] = camera.project(in_cam[seen.camera == number])
     raw = seen.pixels - image
-    loose = scene.loose_px > 0 and bool(np.isfinite(raw).all())
-    return _Projection(in_cam, raw, _by_view(scene, seen, in_cam) if loose else None)
+    if not (scene.loose_px > 0 and np.isfinite(raw).all()):
+        return _Projection(in_cam, raw, None, None)
+    by_view = _by_view(scene, seen, in_cam)
+    return _Projection(in_cam, raw, by_view, motion_equations(raw, by_view, np.ones(len(raw)), seen.starts))
 
 
 def _bend_points(scene: BoardScene, seen: _Observations) -> Float[np.ndarray, "n 3"]:
@@ -346,49 +375,54 @@ def _move_points(
     return np.asarray(np.einsum("nij,nj->ni", rotations, points) + translations)
 
 
-def _jacobian(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]) -> csr_array:
-    """Derivative of the projections by all unknowns, in the order of :func:`_sizes`."""
+def _derivatives(
+    scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 2 w"]:
+    """Derivatives of the projections by the unknowns in :func:`_columns`."""
     by_point, by_parameters = _by_cameras(scene, seen, in_cam)
     turn = np.stack([place.rotation for place in scene.cam_from_rig.values()])[seen.camera]
     by_rig = by_point @ turn
     weights, slopes = seen.weights(scene)
     places = _at_instants(scene, seen, _bend_points(scene, seen))
     turns = np.stack([pose.rotation for pose in scene.rig_from_board.values()])[seen.near[seen.view]]
-    by_body = np.einsum("nij,nk,nkjm->nim", by_rig, weights, turns)
+    by_body = by_rig @ np.einsum("nk,nkjm->njm", weights, turns)
     normals = np.stack([mount.rotation[:, 2] for mount in _all_mounts(scene, seen)])[seen.board]
     by_bending = np.einsum("nij,nj->ni", by_body, normals)[:, :, None] * seen.basis[:, None]
     blocks = [by_parameters, _by_motion(by_point, in_cam), by_bending]
-    which = [(_LENSES, seen.camera), (_CAMERAS, seen.camera), (_BENDINGS, 0 * seen.camera)]
     if scene.shape is not None:
         blocks += [by_body * share[:, None, None] for share in seen.shares.T]
-        which += [(_SHAPES, node) for node in seen.nodes.T]
-    for k, instant in enumerate(seen.near[seen.view].T):
-        blocks.append(weights[:, k, None, None] * _by_motion(by_rig, places[:, k]))
-        which.append((_BOARDS, instant))
+    blocks += [weights[:, k, None, None] * _by_motion(by_rig, places[:, k]) for k in range(places.shape[1])]
     if scene.body_from_board:
-        mount, mounted = _mount_of(scene, seen)
+        _, mounted = _mount_of(scene, seen)
         blocks.append(mounted[:, None, None] * _by_motion(by_body, _bend_points(scene, seen)))
-        which.append((_MOUNTS, mount))
     if scene.timing is not None:
         by_time = np.einsum("nij,nk,nkj->ni", by_rig, slopes, places)[:, :, None]
         blocks += [by_time, by_time]
-        which += [(_CAMERA_DELAYS, seen.camera), (_VIEW_DELAYS, seen.view)]
         if scene.timing.readout:
             blocks.append(by_time * seen.rows[:, None, None])
-            which.append((_READOUTS, seen.camera))
-    first = np.cumsum([0, *_sizes(scene)])
-    columns = [
-        first[group] + block.shape[2] * index[:, None] + np.arange(block.shape[2])
-        for block, (group, index) in zip(blocks, which, strict=True)
+    return np.concatenate(blocks, axis=2)
+
+
+def _columns(scene: BoardScene, seen: _Observations) -> Int[np.ndarray, "n w"]:
+    """Of each corner, the unknowns that it has to do with, in the order of :func:`_sizes`."""
+    which = [
+        (_LENSES, seen.camera, _numbers(scene)),
+        (_CAMERAS, seen.camera, _PLACE),
+        (_BENDINGS, 0 * seen.camera, len(scene.bending_mm)),
     ]
-    values, column = np.concatenate(blocks, axis=2), np.concatenate(columns, axis=1)
-    width = values.shape[2]
-    jacobian = csr_array(
-        (values.ravel(), np.repeat(column, 2, axis=0).ravel(), width * np.arange(2 * len(in_cam) + 1)),
-        shape=(2 * len(in_cam), first[-1]),
+    if scene.shape is not None:
+        which += [(_SHAPES, node, 3) for node in seen.nodes.T]
+    which += [(_BOARDS, instant, _PLACE) for instant in seen.near[seen.view].T]
+    if scene.body_from_board:
+        which.append((_MOUNTS, _mount_of(scene, seen)[0], _PLACE))
+    if scene.timing is not None:
+        which += [(_CAMERA_DELAYS, seen.camera, 1), (_VIEW_DELAYS, seen.view, 1)]
+        if scene.timing.readout:
+            which.append((_READOUTS, seen.camera, 1))
+    first = np.cumsum([0, *_sizes(scene)])
+    return np.concatenate(
+        [first[kind] + size * index[:, None] + np.arange(size) for kind, index, size in which], axis=1
     )
-    jacobian.sum_duplicates()
-    return jacobian
 
 
 def _mount_of(scene: BoardScene, seen: _Observations) -> tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
@@ -443,9 +477,11 @@ class _Free:
     """Inverse of their covariance, before any image."""
     of_instants: Int[np.ndarray, "p"]
     """Which of the free ones belong to single instants."""
+    layout: Layout
+    """Which of them each corner has to do with."""
 
     @staticmethod
-    def of(scene: BoardScene, board: Target, *, only_boards: bool) -> _Free:
+    def of(scene: BoardScene, seen: _Observations, board: Target, *, only_boards: bool) -> _Free:
         """All but the place of the first camera, which is the rig, and what a board with terraces has no use of; or
         the places of the board alone, and the delays of the views."""
         sizes = _sizes(scene)
@@ -466,6 +502,9 @@ class _Free:
         if only_boards:
             free = np.isin(kind, (_BOARDS, _VIEW_DELAYS))
         free[lenses : lenses + _PLACE] = False
+        for k, camera in enumerate(scene.cameras.values()):
+            if camera.lens.splined:
+                free[_numbers(scene) * k + camera.parameter_names.index("reach")] = False
         if board.terraces > 1:
             free[np.flatnonzero(kind == _BENDINGS)[1:]] = False
         if scene.timing is not None:
@@ -477,7 +516,11 @@ class _Free:
         if scene.shape is not None and len(of_shape):
             assert isinstance(board, Board)
             prior[np.ix_(of_shape, of_shape)] = scene.shape.precision(board)
-        return _Free(columns, prior, np.flatnonzero(np.isin(kind[columns], (_BOARDS, _VIEW_DELAYS))))
+        of_instants = np.flatnonzero(np.isin(kind[columns], (_BOARDS, _VIEW_DELAYS)))
+        number = np.full(len(free), -1)
+        number[columns] = np.arange(len(columns))
+        layout = Layout.of(number[_columns(scene, seen)], seen.starts, len(columns))
+        return _Free(columns, prior, of_instants, layout)
 
 
 def _first_of_instants(views: Iterable[tuple[str, str]]) -> Bool[np.ndarray, "v"]:
@@ -503,26 +546,24 @@ def adjust_board(
     Raises ReconstructionError where the images leave something undetermined, or a corner lies behind a camera.
     """
     seen = _Observations.of(views, board, start)
-    free = _Free.of(start, board, only_boards=only_boards)
+    free = _Free.of(start, seen, board, only_boards=only_boards)
     scene, settled = _minimize(start, seen, free)
     told = not (only_boards or keep_scales) and (scene.shape is not None or scene.loose_px > 0)
     for _ in range(_TELLINGS if told else 0):
         before, scene = scene, _as_told(scene, seen, free, board)
         if _is_told_alike(before, scene):
             break
-        free = _Free.of(scene, board, only_boards=only_boards)
+        free = _Free.of(scene, seen, board, only_boards=only_boards)
         scene, settled = _minimize(scene, seen, free)
     there = _project(scene, seen)
     pieces = np.split(there.raw, seen.starts[1:-1])
-    nothing = np.zeros((0, 0))
-    covariance, moved = (nothing, nothing) if only_boards else _camera_covariance(scene, seen, free)
+    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
     return Adjusted(
         scene=scene,
-        sigma_px=_scale(_project_out_motions(scene, seen, there, None)[0]),
+        sigma_px=sigma_px,
         residuals=dict(zip(seen.keys, pieces, strict=True)),
-        covariance=covariance,
-        moved=moved,
         settled=settled,
+        equations=None if only_boards else _Equations.of(scene, seen, there, sigma_px, free),
     )
 
 
@@ -530,13 +571,12 @@ def unevenness_score(found: Adjusted, views: Views, board: Board) -> float:
     """Score test of an even board: the mean square, over the coordinates of its corners, of how hard the residuals pull
     at each, in standard deviations; about 1 if all lie as given."""
     scene = replace(found.scene, shape=BoardShape.even(board))
-    seen, free = _Observations.of(views, board, scene), _Free.of(scene, board, only_boards=False)
-    sizes = _sizes(scene)
-    of_shape = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _SHAPES
+    seen = _Observations.of(views, board, scene)
+    free = _Free.of(scene, seen, board, only_boards=False)
+    of_shape = _of_kind(scene, free, _SHAPES)
     rows = _weigh_equations(scene, seen, _project(scene, seen), found.sigma_px, free)
-    jacobian = rows.jacobian.toarray()[:, of_shape]
-    told = np.sum(jacobian**2, axis=0)
-    pull = jacobian.T @ rows.residuals
+    told = np.diag(matrix_of(rows.values, free.layout))[of_shape]
+    pull = rows.pull[of_shape]
     return float(np.mean(pull[told > 0] ** 2 / told[told > 0]))
 
 
@@ -563,20 +603,40 @@ def _minimize(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[Boar
     if not there.is_whole:
         raise ReconstructionError("calibration: a corner of the board lies behind a camera that saw it")
     damping, settled, steps = 1e-4, False, 0
+    here = _Slope.of(scene, seen, there, free)
     while not settled and steps < _STEPS and damping < _MOST_DAMPING:
         steps += 1
-        sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
-        cost = _cost(scene, seen, there, sigma_px, free)
-        matrix, gradient = _normal(scene, seen, there, sigma_px, free)
-        step = _solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
+        step = _solve(here.matrix + damping * np.diag(np.diag(here.matrix)), here.gradient)
         candidate = _apply_step(scene, free, step)
         after = None if candidate is None else _project(candidate, seen)
-        if candidate is None or after is None or not _cost(candidate, seen, after, sigma_px, free) <= cost:
+        if candidate is None or after is None or not _cost(candidate, seen, after, here.sigma_px, free) <= here.cost:
             damping *= 10
             continue
-        settled = float(step @ gradient) < _SETTLED
-        scene, there, damping = candidate, after, max(damping / 10, 1e-12)
+        settled = float(step @ here.gradient) < _SETTLED
+        scene, damping = candidate, max(damping / 10, 1e-12)
+        here = here if settled else _Slope.of(scene, seen, after, free)
     return scene, settled
+
+
+@dataclass(frozen=True, eq=False)
+class _Slope:
+    """What a step from a scene follows from."""
+
+    sigma_px: float
+    cost: float
+    matrix: Float[np.ndarray, "k k"]
+    """Of the normal equations."""
+    gradient: Float[np.ndarray, "k"]
+
+    @staticmethod
+    def of(scene: BoardScene, seen: _Observations, there: _Projection, free: _Free) -> _Slope:
+        """Given where it puts the corners."""
+        sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
+        apart = _project_out_motions(scene, seen, there, sigma_px)
+        cost = _cost_of(scene, *apart, sigma_px, free)
+        return _Slope(
+            sigma_px, cost, *_normal(scene, _weigh_equations(scene, seen, there, sigma_px, free, apart), free)
+        )
 
 
 def _project_out_motions(
@@ -588,16 +648,18 @@ def _project_out_motions(
     """The residuals without what the board was elsewhere by in each view, and that, px; by a standard deviation of a
     coordinate, or by what it is found to be."""
     motions, residuals, by_view = np.zeros((len(seen.keys), _PLACE)), there.raw, there.by_view
-    if by_view is None:
+    if by_view is None or there.of_motions is None:
         return residuals, motions
     for _ in range(_LOOSE_ROUNDS):
-        sigma = _scale(residuals) if sigma_px is None else sigma_px
-        weights = _weights(residuals, sigma)
-        matrix = _of_views(seen, np.einsum("n,nik,nil->nkl", weights, by_view, by_view))
-        right = _of_views(seen, np.einsum("n,nik,ni->nk", weights, by_view, there.raw))
+        sigma, before = _scale(residuals) if sigma_px is None else sigma_px, motions
+        odd = 1 - sigma**2 * _weights(residuals, sigma)
+        less, pull = motion_equations(there.raw, by_view, odd, seen.starts)
+        matrix, right = (there.of_motions[0] - less) / sigma**2, (there.of_motions[1] - pull) / sigma**2
         matrix += np.eye(_PLACE) / scene.loose_px**2
         motions = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
-        residuals = there.raw - np.einsum("nik,nk->ni", by_view, motions[seen.view])
+        if np.array_equal(motions, before):
+            break
+        residuals = without_motions(there.raw, by_view, seen.starts, motions)
     return residuals, motions
 
 
@@ -640,7 +702,16 @@ def _cost(
     free: _Free,
 ) -> float:
     """Huber loss of the residuals, and the prior; infinite where a corner lies behind a camera."""
-    residuals, motions = _project_out_motions(scene, seen, there, sigma_px)
+    return _cost_of(scene, *_project_out_motions(scene, seen, there, sigma_px), sigma_px, free)
+
+
+def _cost_of(
+    scene: BoardScene,
+    residuals: Float[np.ndarray, "n 2"],
+    motions: Float[np.ndarray, "v 6"],
+    sigma_px: float,
+    free: _Free,
+) -> float:
     lengths = np.linalg.norm(residuals, axis=1) / sigma_px
     if not np.isfinite(lengths).all():
         return np.inf
@@ -658,6 +729,8 @@ def _lens_precision(camera: Camera, numbers: int) -> Float[np.ndarray, "n"]:
     for terms in (camera.lens.numerator, camera.lens.denominator):
         for order, place in enumerate(terms):
             sigma[place] = _RADIAL_SIGMA / corner ** (2 * max(order - 1, 0))
+    if camera.lens.splined:
+        sigma[-2 * camera.lens.splined**2 :] = _CONTROL_PX / camera.focal_px.mean()
     known = np.concatenate([[0.0, 0.0], centre**-2.0, sigma**-2.0])
     return np.pad(known, (0, numbers - len(known)), constant_values=1.0)
 
@@ -681,40 +754,43 @@ def _prior_offset(scene: BoardScene) -> Float[np.ndarray, "k"]:
     return np.concatenate([*lenses, places, scene.bending_mm, shape, mounts, times])
 
 
-def _normal(
-    scene: BoardScene,
-    seen: _Observations,
-    there: _Projection,
-    sigma_px: float,
-    free: _Free,
-) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
+def _normal(scene: BoardScene, rows: _Rows, free: _Free) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
     """Of the free unknowns: the matrix of the normal equations, and the gradient."""
-    rows = _weigh_equations(scene, seen, there, sigma_px, free)
-    return rows.matrix + free.prior, rows.jacobian.T @ rows.residuals - free.prior @ _prior_offset(scene)[free.columns]
+    return rows.matrix + free.prior, rows.pull - free.prior @ _prior_offset(scene)[free.columns]
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
     """Equations of standard deviation 1, and what the board was elsewhere by in each view, px."""
 
-    jacobian: csr_array
-    """By the free unknowns."""
-    residuals: Float[np.ndarray, "m"]
-    by_motion: Float[np.ndarray, "l 6"]
-    """By the motion of the board in its view; without rows where there is none."""
+    layout: Layout
+    values: Float[np.ndarray, "n 2 w"]
+    """Derivatives by the unknowns that each corner has to do with."""
+    residuals: Float[np.ndarray, "n 2"]
+    by_motion: Float[np.ndarray, "n 2 6"] | None
+    """Derivatives by the motion of the board in its view; None where there is none."""
     motions: Float[np.ndarray, "v 6"]
     spread: Float[np.ndarray, "v 6 6"]
     """Covariance of the motions, were all else known; zeros where there are none."""
-    together: Float[np.ndarray, "v 6 k"]
-    """Of the motions and the unknowns, in the matrix of the normal equations."""
+    between: Float[np.ndarray, "t 6"]
+    """Of the unknowns of each view and its motion, in the matrix of the normal equations."""
 
-    @property
+    @cached_property
     def matrix(self) -> Float[np.ndarray, "k k"]:
         """Of the normal equations of the unknowns, which the motions follow."""
-        count, each, unknowns = self.together.shape
-        flat = (count * each, unknowns)
-        own = self.together.reshape(flat).T @ (self.spread @ self.together).reshape(flat)
-        return np.asarray((self.jacobian.T @ self.jacobian).toarray() - own)
+        if self.by_motion is None:
+            return matrix_of(self.values, self.layout)
+        return matrix_of(self.values, self.layout, self.between, self.spread)
+
+    @property
+    def pull(self) -> Float[np.ndarray, "k"]:
+        """Product of the transposed derivatives with the residuals."""
+        return gradient_of(self.values, self.residuals, self.layout)
+
+    def follow(self, view: int) -> tuple[Int[np.ndarray, "u"], Float[np.ndarray, "6 u"]]:
+        """Unknowns that a view has to do with, and by how much its motion follows each."""
+        own = slice(self.layout.first[view], self.layout.first[view + 1])
+        return self.layout.unknowns[own], self.spread[view] @ self.between[own].T
 
 
 def _weigh_equations(
@@ -723,22 +799,39 @@ def _weigh_equations(
     there: _Projection,
     sigma_px: float,
     free: _Free,
+    apart: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "v 6"]] | None = None,
 ) -> _Rows:
-    residuals, motions = _project_out_motions(scene, seen, there, sigma_px)
-    weights = np.repeat(np.sqrt(_weights(residuals, sigma_px)), 2)
-    jacobian = csr_array(_jacobian(scene, seen, there.in_cam)[:, free.columns] * weights[:, None])
-    weighted, view = residuals.ravel() * weights, np.repeat(seen.view, 2)
+    """``apart``, if it is known: what :func:`_project_out_motions` returns."""
+    residuals, motions = apart or _project_out_motions(scene, seen, there, sigma_px)
+    weights = np.sqrt(_weights(residuals, sigma_px))[:, None]
+    values, weighed = _derivatives(scene, seen, there.in_cam) * weights[:, :, None], residuals * weights
     if there.by_view is None:
-        none, together = np.zeros((0, _PLACE)), np.zeros((0, _PLACE, len(free.columns)))
-        return _Rows(jacobian, weighted, none, none, np.zeros((0, _PLACE, _PLACE)), together)
-    by_motion = (there.by_view * weights.reshape(-1, 2, 1)).reshape(-1, _PLACE)
-    matrix = _of_views(seen, np.einsum("nik,nil->nkl", *2 * [by_motion.reshape(-1, 2, _PLACE)]))
-    columns = (_PLACE * view[:, None] + np.arange(_PLACE)).ravel()
-    shape = (len(view), motions.size)
-    spread_out = csr_array((by_motion.ravel(), columns, _PLACE * np.arange(len(view) + 1)), shape=shape)
-    together = (spread_out.T @ jacobian).toarray().reshape(*motions.shape, -1)
-    spread = np.linalg.inv(matrix + np.eye(_PLACE) / scene.loose_px**2)
-    return _Rows(jacobian, weighted, by_motion, motions, spread, together)
+        spread, between = np.zeros((len(seen.keys), _PLACE, _PLACE)), np.zeros((len(free.layout.unknowns), _PLACE))
+        return _Rows(free.layout, values, weighed, None, motions, spread, between)
+    by_motion = there.by_view * weights[:, :, None]
+    matrix, _ = motion_equations(weighed, by_motion, np.ones(len(weighed)), seen.starts)
+    spread = np.asarray(np.linalg.inv(matrix + np.eye(_PLACE) / scene.loose_px**2))
+    between = between_motions(values, by_motion, free.layout)
+    return _Rows(free.layout, values, weighed, by_motion, motions, spread, between)
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """The equations at the minimum."""
+
+    seen: _Observations
+    free: _Free
+    rows: _Rows
+    matrix: Float[np.ndarray, "k k"]
+    """Of the normal equations, with what the prior tells."""
+
+    @staticmethod
+    def of(scene: BoardScene, seen: _Observations, there: _Projection, sigma_px: float, free: _Free) -> _Equations:
+        """Raises ReconstructionError where the images leave something undetermined."""
+        rows = _weigh_equations(scene, seen, there, sigma_px, free)
+        matrix = rows.matrix + free.prior
+        _solve(matrix, np.zeros(len(matrix)))
+        return _Equations(seen, free, rows, matrix)
 
 
 def _independent(
@@ -748,13 +841,17 @@ def _independent(
     instants = seen.near[:, 0]
     for instant in np.unique(instants):
         jacobians, residuals = [], []
-        for view in np.flatnonzero(instants == instant):
-            part = slice(2 * seen.starts[view], 2 * seen.starts[view + 1])
-            jacobians.append(rows.jacobian[part].toarray())
-            residuals.append(rows.residuals[part])
-            if loose_px:
-                follow = rows.spread[view] @ rows.together[view]
-                jacobians = [*jacobians[:-1], jacobians[-1] - rows.by_motion[part] @ follow, follow / loose_px]
+        for view in np.flatnonzero(instants == instant).tolist():
+            part = slice(seen.starts[view], seen.starts[view + 1])
+            jacobian = rows.layout.rows_of(view, rows.values)
+            jacobians.append(jacobian)
+            residuals.append(rows.residuals[part].ravel())
+            if rows.by_motion is not None:
+                unknowns, of_view = rows.follow(view)
+                jacobian[:, unknowns] -= rows.by_motion[part].reshape(-1, _PLACE) @ of_view
+                follow = np.zeros((_PLACE, rows.layout.count))
+                follow[:, unknowns] = of_view / loose_px
+                jacobians.append(follow)
                 residuals.append(rows.motions[view] / loose_px)
         yield np.concatenate(jacobians), np.concatenate(residuals)
 
@@ -800,9 +897,10 @@ def _apply_step(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) ->
 
 
 def _all_moved(poses: Mapping[_Key, Rigid3], motions: Float[np.ndarray, "k"]) -> dict[_Key, Rigid3]:
+    turns = Rotation.from_rotvec(motions.reshape(-1, _PLACE)[:, :3]).as_matrix()
+    shifts = motions.reshape(-1, _PLACE)[:, 3:]
     return {
-        name: Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ pose
-        for (name, pose), motion in zip(poses.items(), motions.reshape(-1, _PLACE), strict=True)
+        name: Rigid3(turn, shift) @ pose for (name, pose), turn, shift in zip(poses.items(), turns, shifts, strict=True)
     }
 
 
@@ -816,15 +914,16 @@ def _as_told(scene: BoardScene, seen: _Observations, free: _Free, board: Target)
     sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
     rows = _weigh_equations(scene, seen, there, sigma_px, free)
     inverse = _solve(rows.matrix + free.prior, np.eye(len(free.columns)))
-    sizes = _sizes(scene)
-    of_shape = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _SHAPES
+    of_shape = _of_kind(scene, free, _SHAPES)
     if scene.shape is not None and of_shape.any():
         assert isinstance(board, Board)
         variances = np.diag(inverse)[of_shape].reshape(-1, 3)
         scene = replace(scene, shape=scene.shape.as_uneven(variances, board))
     if scene.loose_px:
-        follow = (rows.spread @ rows.together).reshape(-1, len(inverse))
-        unsure = np.trace(rows.spread, axis1=1, axis2=2).sum() + np.sum((follow @ inverse) * follow)
+        unsure = np.trace(rows.spread, axis1=1, axis2=2).sum()
+        for view in range(len(seen.keys)):
+            unknowns, follow = rows.follow(view)
+            unsure += np.sum((follow @ inverse[np.ix_(unknowns, unknowns)]) * follow)
         told = rows.motions.size - unsure / scene.loose_px**2
         loose_px = float(np.sqrt(np.sum(rows.motions**2) / max(told, 1e-3)))
         scene = replace(scene, loose_px=float(np.clip(loose_px, _TIGHT * sigma_px, _LOOSEST * sigma_px)))
@@ -838,29 +937,26 @@ def _is_told_alike(one: BoardScene, other: BoardScene) -> bool:
 
 
 def _camera_covariance(
-    scene: BoardScene, seen: _Observations, free: _Free
+    scene: BoardScene, known: _Equations
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "i m"]]:
     """Of the parameters and the motions of all cameras, in the frame in which these sum up to nothing, and of their
     readouts: as the scatter of the corners gives it, and by how much each instant moves them."""
-    there = _project(scene, seen)
-    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
-    rows = _weigh_equations(scene, seen, there, sigma_px, free)
-    matrix = rows.matrix + free.prior
+    free, matrix = known.free, known.matrix
     sizes = _sizes(scene)
     kind = np.repeat(np.arange(len(sizes)), sizes)
     size = sizes[_LENSES] + sizes[_CAMERAS] + sizes[_READOUTS]
     place = np.full(len(kind), -1)  # of each unknown in the covariance
     place[np.isin(kind, (_LENSES, _CAMERAS, _READOUTS))] = np.arange(size)
-    known = np.flatnonzero(place[free.columns] >= 0)
-    whole, among = np.zeros((size, size)), place[free.columns[known]]
-    whole[np.ix_(among, among)] = _solve(matrix, np.eye(len(matrix))[:, known])[known]
+    shown = np.flatnonzero(place[free.columns] >= 0)
+    whole, among = np.zeros((size, size)), place[free.columns[shown]]
+    whole[np.ix_(among, among)] = _solve(matrix, np.eye(len(matrix))[:, shown])[shown]
     project = np.eye(size)
     places = slice(sizes[_LENSES], sizes[_LENSES] + sizes[_CAMERAS])
     project[places, places] = _without_common_motion(scene)
-    common, moved = influences(matrix, _independent(rows, seen, scene.loose_px), free.of_instants)
+    common, moved = influences(matrix, _independent(known.rows, known.seen, scene.loose_px), free.of_instants)
     by_instant = np.zeros((len(moved), size))
-    shown = place[free.columns[common]] >= 0
-    by_instant[:, place[free.columns[common[shown]]]] = moved[:, shown]
+    of_cameras = place[free.columns[common]] >= 0
+    by_instant[:, place[free.columns[common[of_cameras]]]] = moved[:, of_cameras]
     return np.asarray(project @ whole @ project.T), by_instant @ project.T
 
 
@@ -885,13 +981,22 @@ def _adjoint(target_from_source: Rigid3) -> Float[np.ndarray, "6 6"]:
 
 
 def readout_score(scene: BoardScene, views: Views, board: Target) -> float:
-    """How far a first step from the readouts of a scene would change one of them, in its standard deviations."""
-    seen, free = _Observations.of(views, board, scene), _Free.of(scene, board, only_boards=False)
-    there, sizes = _project(scene, seen), _sizes(scene)
-    of_readouts = np.repeat(np.arange(len(sizes)), sizes)[free.columns] == _READOUTS
-    matrix, gradient = _normal(scene, seen, there, _scale(_project_out_motions(scene, seen, there, None)[0]), free)
-    inverse = _solve(matrix, np.eye(len(matrix))[:, of_readouts])
-    return float(np.max(np.abs(gradient @ inverse) / np.sqrt(np.diag(inverse[of_readouts]))))
+    """How far a first step from the readouts of a scene would change one of them, in its standard deviations by how
+    much the instants disagree."""
+    seen = _Observations.of(views, board, scene)
+    free, there, count = _Free.of(scene, seen, board, only_boards=False), _project(scene, seen), len(scene.cameras)
+    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
+    known = _Equations.of(scene, seen, there, sigma_px, free)
+    by_corners, moved = _camera_covariance(scene, known)
+    sigmas = np.sqrt(np.diag(covariance_of(by_corners[-count:, -count:], moved[:, -count:])))
+    _, gradient = _normal(scene, known.rows, free)
+    return float(np.max(np.abs(_solve(known.matrix, gradient)[_of_kind(scene, free, _READOUTS)]) / sigmas))
+
+
+def _of_kind(scene: BoardScene, free: _Free, kind: int) -> Bool[np.ndarray, "k"]:
+    """Which of the free unknowns are of a kind."""
+    sizes = _sizes(scene)
+    return np.asarray(np.repeat(np.arange(len(sizes)), sizes)[free.columns] == kind)
 
 
 def readout_sigmas(found: Adjusted) -> dict[str, float]:

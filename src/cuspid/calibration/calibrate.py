@@ -57,8 +57,8 @@ _MUCH_MORE = 3.0
 _LESS = 0.9
 """Residuals in views that a calibration was not made from, as a share of those if all cameras exposed together, below
 which they did not; and the share of the views that must then remain."""
-_ROLLING = 4.0
-"""How far readouts of 0 must be from the best ones, in standard deviations by the corners, for these to be tried."""
+_ROLLING = 3.0
+"""How far readouts of 0 must be from the best ones, in standard deviations, for these to be tried."""
 _RUN = 6
 """Number of successive instants that stay in the same half, where cameras do not expose together."""
 _ODD_SIZE = 0.02
@@ -72,8 +72,9 @@ class CalibrationOptions(Options):
     """The model of the lenses, and which views are left out."""
 
     lens: LensName = "auto"
-    """COLMAP's name of the model of the lenses. auto: for each camera the simplest one that no richer one beats, by
-    more than chance, in views that it was not made from."""
+    """COLMAP's name of the model of the lenses, or splined: a fisheye with a grid of shifts, for what no polynomial
+    follows. auto: for each camera the simplest one that no richer one beats, by more than chance, in views that it was
+    not made from."""
     shutter: Literal["auto", "global"] = "auto"
     """auto: where a filmed board moves, it is estimated how long after the first row of an image the last one is
     exposed, and kept if that explains images that it was not estimated from. global: all rows are exposed at once."""

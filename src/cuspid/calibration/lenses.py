@@ -9,6 +9,7 @@ standard errors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,15 +19,23 @@ from jaxtyping import Float
 from cuspid.calibration.bundle import Adjusted, adjust_board, in_front, of_instants
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone
-from cuspid.geometry.cameras import MODELS
+from cuspid.geometry.cameras import GRID, MODELS
 from cuspid.model.board import Target
 from cuspid.model.camera import Camera
 from cuspid.runtime.errors import InputError, ReconstructionError
 
-LensName = Literal["auto", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"]
+LensName = Literal["auto", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "splined"]
 """A model, or the one that the images call for."""
+_SPLINED, _ITS_BASE = "SPLINED_FISHEYE", "OPENCV_FISHEYE"
 _LADDER = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "THIN_PRISM_FISHEYE")
 """The models, simplest first. The last one is tried only where one of those before it is better than the first."""
+_CELLS, _LEAST_IN_CELL = (8, 6), 3
+"""Cells of an image in which residuals are compared from view to view, and the views that must show corners in one."""
+_PATTERN = 1.5
+"""Mean square of the residuals in cells that views have in common, in what chance makes of them, beyond which a splined
+lens is tried."""
+_MARGIN = 1.02
+"""How much farther the grid of a splined lens reaches than what was seen."""
 _FOLDS, _MOST_VIEWS = 4, 24
 _ODD = 10.0
 """Residuals of a view, in usual ones, beyond which it shows something else."""
@@ -66,11 +75,12 @@ def choose_lens(
     Raises ReconstructionError where no camera fits the views.
     """
     if asked != "auto":
-        alone = calibrated_as(asked, views, board, size)
+        model = _SPLINED if asked == "splined" else asked
+        alone = calibrated_as(model, views, board, size)
         sound = _sound(views, alone)
         if len(sound) < len(views):
-            alone = calibrated_as(asked, sound, board, size)
-        return LensChoice(model=asked, held_out_px={}), alone
+            alone = calibrated_as(model, sound, board, size)
+        return LensChoice(model=model, held_out_px={}), alone
     choice, simple = _first_that_fits(views, board, size)
     sound = _sound(views, simple)
     if len(sound) < 2 * LEAST_VIEWS:
@@ -88,10 +98,12 @@ def choose_lens(
             continue
     if not squares:
         return choice, simple
-    chosen = next(iter(squares))
-    for model in list(squares)[1:]:
-        if _is_better(squares[model], squares[chosen]):
-            chosen = model
+    chosen = _simplest_best(squares)
+    if _common_pattern(found[chosen], some) > _PATTERN:
+        with suppress(ReconstructionError):
+            found[_SPLINED] = calibrated_as(_SPLINED, some, board, size, found.get(_LADDER[0]))
+            squares[_SPLINED] = _held_out(found[_SPLINED], some, board)
+            chosen = _simplest_best(squares)
     rms = {model: float(np.sqrt(np.mean(each[np.isfinite(each)]))) for model, each in squares.items()}
     others = [model for model in rms if model != chosen]
     richer = [model for model in others if _size(found[model]) > _size(found[chosen])]
@@ -109,6 +121,30 @@ def choose_lens(
     except ReconstructionError:  # the others lie where such a lens shows nothing
         return choice, simple
     return taken, alone
+
+
+def _simplest_best(squares: Mapping[str, Float[np.ndarray, "v"]]) -> str:
+    """The first model that no later one beats."""
+    chosen = next(iter(squares))
+    for model in list(squares)[1:]:
+        if _is_better(squares[model], squares[chosen]):
+            chosen = model
+    return chosen
+
+
+def _common_pattern(found: Adjusted, views: Sequence[BoardView]) -> float:
+    """How far the residuals of all views together are off in the cells of the image, in how far those of single views
+    are: a mean square, about 1 where views have nothing in common."""
+    camera = found.scene.cameras[""]
+    sums = np.zeros((len(found.residuals), *_CELLS, 2))
+    for of_view, ((_, instant), residuals) in zip(sums, found.residuals.items(), strict=True):
+        share = views[int(instant)].pixels / [camera.width, camera.height]
+        column, row = np.clip((share * _CELLS).astype(int), 0, np.array(_CELLS) - 1).T
+        np.add.at(of_view, (column, row), residuals)
+    told = np.count_nonzero(sums.any(axis=-1), axis=0) >= _LEAST_IN_CELL
+    if not told.any():
+        return 0.0
+    return float(np.mean(np.sum(sums, axis=0)[told] ** 2 / np.sum(sums**2, axis=0)[told]))
 
 
 def _size(found: Adjusted) -> int:
@@ -149,6 +185,10 @@ def calibrated_as(
     """
     if model == "OPENCV":
         return calibrated_alone(views, board, size)
+    if model == _SPLINED:
+        base = calibrated_as(_ITS_BASE, views, board, size, simple)
+        seen = np.concatenate([view.pixels for view in views])
+        return calibrated_alone(views, board, size, [with_spline(base.scene.cameras[""], seen)])
     try:
         simple = simple or calibrated_alone(views, board, size)
         pixels = np.concatenate([view.pixels for view in views])
@@ -174,6 +214,16 @@ def as_model(camera: Camera, model: str, pixels: Float[np.ndarray, "n 2"]) -> Ca
     distortion = np.zeros(len(lens.names))
     distortion[lens.numerator[0]] = cubic / share
     return replace(camera, model=model, focal_px=share * camera.focal_px, distortion=distortion, covariance=None)
+
+
+def with_spline(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Camera:
+    """A camera of the base of splined lenses as one of these, whose grid covers some pixels and shifts nothing yet."""
+    rays = camera.directions(pixels)
+    side = np.linalg.norm(rays[:, :2], axis=1)
+    ideal = rays[:, :2] * (np.arctan2(side, rays[:, 2]) / np.maximum(side, 1e-12))[:, None]
+    reach = _MARGIN * float(np.nanmax(np.abs(ideal)))
+    distortion = np.concatenate([camera.distortion, [reach], np.zeros(2 * GRID**2)])
+    return replace(camera, model=_SPLINED, distortion=distortion, covariance=None)
 
 
 def _ideal(model: str, size: tuple[int, int], half_deg: float) -> Camera:

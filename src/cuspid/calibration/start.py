@@ -17,7 +17,7 @@ from jaxtyping import Float
 from cuspid.calibration.agreement import agreed_on, apart
 from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, in_front, of_instants
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, pieces
-from cuspid.geometry import Rigid3
+from cuspid.geometry import Rigid3, best_similarity
 from cuspid.geometry.graph import parts_of
 from cuspid.model.board import Target
 from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
@@ -148,32 +148,34 @@ def joined(
 def renumbered(found: Adjusted, views: Views, board: Target) -> tuple[BoardScene, Views] | None:
     """The views with the corners at some instant numbered otherwise, where a board that is not quite even fits much
     better so, and the scene with the board turned likewise; None if there is no such instant."""
-    best: tuple[float, BoardScene, dict[tuple[str, str], BoardView]] | None = None
-    for instant in found.scene.rig_from_board:
-        own = {key: view for key, view in views.items() if key[1] == instant}
-        if not own:
+    # Where the board was at other moments tells nothing about the numbering at this one.
+    scene = replace(found.scene, timing=None)
+    shown = {key: view for key, view in views.items() if key[1] in scene.rig_from_board}
+    usual = _rms_by_instant(found.residuals, shown)
+    best: tuple[float, str, Rigid3, dict[tuple[str, str], BoardView]] | None = None
+    for order in board.orders[1:]:
+        _, turn, shift = best_similarity(board.corners, board.corners[order])
+        back = Rigid3(turn, shift).inverse()
+        start = replace(scene, rig_from_board={instant: pose @ back for instant, pose in scene.rig_from_board.items()})
+        turned = {key: view.renumbered(order) for key, view in shown.items()}
+        try:
+            other = adjust_board(start, turned, board, only_boards=True)
+        except ReconstructionError:
             continue
-        usual = _rms_of([found.residuals[key] for key in own])
-        for order in board.orders[1:]:
-            turned = {key: view.renumbered(order) for key, view in own.items()}
-            name, view = next(iter(turned.items()))
-            try:
-                pose = board_pose(view, board, found.scene.cameras[name[0]])
-                scene = of_instants(found.scene, {instant})
-                there = {instant: found.scene.cam_from_rig[name[0]].inverse() @ pose}
-                other = adjust_board(replace(scene, rig_from_board=there), turned, board, only_boards=True)
-            except (InputError, ReconstructionError):
-                continue
-            ratio = _rms_of(list(other.residuals.values())) / usual
-            if ratio < (best[0] if best else _MUCH_BETTER):
-                best = ratio, other.scene, turned
+        for instant, rms in _rms_by_instant(other.residuals, shown).items():
+            if rms < (best[0] if best else _MUCH_BETTER) * usual[instant]:
+                own = {key: view for key, view in turned.items() if key[1] == instant}
+                best = rms / usual[instant], instant, other.scene.rig_from_board[instant], own
     if best is None:
         return None
-    _, scene, turned = best
-    return replace(found.scene, rig_from_board={**found.scene.rig_from_board, **scene.rig_from_board}), {
-        **views,
-        **turned,
-    }
+    _, instant, pose, own = best
+    return replace(found.scene, rig_from_board={**found.scene.rig_from_board, instant: pose}), {**views, **own}
+
+
+def _rms_by_instant(residuals: Mapping[tuple[str, str], Float[np.ndarray, "n 2"]], views: Views) -> dict[str, float]:
+    """RMS of the residuals of some views, by instant."""
+    instants = dict.fromkeys(instant for _, instant in views)
+    return {instant: _rms_of([residuals[key] for key in views if key[1] == instant]) for instant in instants}
 
 
 def _rms_of(residuals: Sequence[Float[np.ndarray, "n 2"]]) -> float:

@@ -77,9 +77,12 @@ class Camera:
             )
         if len(self.distortion) != len(self.lens.names):
             raise InputError(
-                f"camera: a lens of the model {self.model} has the parameters {', '.join(self.lens.names)}, not "
+                f"camera: a lens of the model {self.model} has the parameters {self.lens.said}, not "
                 f"{len(self.distortion)} numbers"
             )
+        if self.lens.splined and not self.distortion[self.lens.names.index("reach")] > 0:
+            reach = self.distortion[self.lens.names.index("reach")]
+            raise InputError(f"camera: the reach of its grid must be positive, not {reach:g}")
         if not np.isfinite(self.parameters).all():
             raise InputError(f"camera: its parameters are not finite: {shown(self.parameters)}")
 

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from cuspid.model.rig import Rig
 from cuspid.motion.bundle.adjustment import residuals_px
 from cuspid.runtime.errors import InputError, OutputError, ReconstructionError
 from cuspid.runtime.inputs import read_bytes
+from cuspid.storage.calibrations.lenses import ALL, carried
 from cuspid.storage.files import digest_of, hash_file, whole_files
 
 MODEL_FILES = ("cameras", "images", "points3D")
@@ -40,7 +42,9 @@ SCALE_SPREAD = 0.02
 
 
 def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
-    """The same camera as COLMAP's, which has the same models, parameters and pixel origin."""
+    """The same camera as COLMAP's, which has the same models, parameters and pixel origin; with the nearest of its
+    lenses for a splined one, which it lacks."""
+    camera = _with_its_lens(camera)
     return pycolmap.Camera(
         camera_id=camera_id,
         model=camera.model,
@@ -48,6 +52,11 @@ def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
         height=camera.height,
         params=camera.parameters.tolist(),
     )
+
+
+@lru_cache(maxsize=64)
+def _with_its_lens(camera: Camera) -> Camera:
+    return carried(camera, ALL)[0] if camera.lens.splined else camera
 
 
 def colmap_rigid(transform: Rigid3) -> pycolmap.Rigid3d:

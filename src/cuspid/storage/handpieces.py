@@ -104,7 +104,8 @@ def _camera_of_model(value: Mapping[str, Any], width: int, height: int, what: st
     given = np.array(value["params"], dtype=np.float64).ravel()
     if len(given) != len(names):
         raise InputError(
-            f"{what}: params has {len(given)} numbers; those of the model {name} are {len(names)}: {', '.join(names)}"
+            f"{what}: params has {len(given)} numbers; those of the model {name} are {len(names)}: fx, fy, cx, cy, "
+            f"{MODELS[name].said}"
         )
     limits = np.array([100.0 * MOST_PX] * 2 + [2.0 * MOST_PX] * 2 + [_MOST_DISTORTION] * (len(names) - 4))
     for value_of, each, limit in zip(given.tolist(), names, limits.tolist(), strict=True):

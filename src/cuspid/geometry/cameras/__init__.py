@@ -1,6 +1,7 @@
-"""Camera models, under COLMAP's names: how a lens maps directions to the image, with derivatives and inverse."""
+"""Camera models, under COLMAP's names where it has them: how a lens maps directions to the image, with derivatives and
+inverse."""
 
-from cuspid.geometry.cameras.models import LENSES, LONGEST, MODELS, LensModel, fold_radius
+from cuspid.geometry.cameras.models import GRID, LENSES, MODELS, LensModel, fold_radius
 from cuspid.geometry.cameras.projection import (
     camera_jacobian,
     directions_through,
@@ -10,8 +11,8 @@ from cuspid.geometry.cameras.projection import (
 )
 
 __all__ = [
+    "GRID",
     "LENSES",
-    "LONGEST",
     "MODELS",
     "LensModel",
     "camera_jacobian",

@@ -5,6 +5,10 @@ place (u, v) of an *ideal* lens: (x / z, y / z) of a perspective one, or the ang
 vector sideways of an equidistant one. The lens then distorts that place: radially by a factor that is a polynomial of
 r^2 = u^2 + v^2 (or a ratio of two), tangentially by p1 and p2 (D. C. Brown, Photogramm. Eng. 32, 1966), and by thin
 prisms (s1, s2) (J. Weng et al., IEEE Trans. PAMI 14, 1992).
+
+A splined lens shifts that place besides, by what a grid of control points says: a uniform cubic B-spline of (u, v), of
+which those within ``reach`` of the axis, each way, are covered by the grid; farther out it fades away (after the
+splined model of D. Kogan's mrcal, whose base is stereographic). COLMAP has no such model.
 """
 
 from __future__ import annotations
@@ -14,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from numpy.polynomial import Polynomial
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,21 @@ class LensModel:
     """Which are those of what it is divided by."""
     is_equidistant: bool = False
     """Whether the ideal lens is equidistant instead of perspective."""
+    splined: int = 0
+    """Number of control points along each side of the grid that shifts places; 0 where there is none."""
 
+    @property
+    def said(self) -> str:
+        """The names of its parameters, in words."""
+        if not self.splined:
+            return ", ".join(self.names)
+        points = 2 * self.splined**2
+        return f"{', '.join(self.names[:-points])} and {self.splined} x {self.splined} control points of x, then of y"
+
+
+GRID = 11
+"""Number of control points along each side of the grid of a splined lens."""
+_CONTROL = tuple(f"{axis}{row}_{column}" for axis in "xy" for row in range(GRID) for column in range(GRID))
 
 MODELS: Mapping[str, LensModel] = {
     "OPENCV": LensModel(0, ("k1", "k2", "p1", "p2"), (0, 1)),
@@ -40,10 +57,12 @@ MODELS: Mapping[str, LensModel] = {
     "THIN_PRISM_FISHEYE": LensModel(
         3, ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), (0, 1, 4, 5), is_equidistant=True
     ),
+    "SPLINED_FISHEYE": LensModel(
+        4, ("k1", "k2", "k3", "k4", "reach", *_CONTROL), (0, 1, 2, 3), is_equidistant=True, splined=GRID
+    ),
 }
-LENSES = tuple(MODELS)
-LONGEST = max(len(model.names) for model in MODELS.values())
-"""Most parameters of a distortion."""
+LENSES = tuple(name for name, model in MODELS.items() if not model.splined)
+"""The models that COLMAP has."""
 
 
 _NOTHING = 1e-12
@@ -53,12 +72,17 @@ _NOTHING = 1e-12
 def fold_radius(model: LensModel, distortion: Float[np.ndarray, "k"]) -> float:
     """Ideal radius up to which the distorted one grows with it: from there on the model folds the image back onto
     itself, and means nothing. Infinite for a perspective lens that never folds; at most pi for an equidistant one."""
-    numerator = Polynomial([1.0, *distortion[list(model.numerator)]])  # of r^2
-    denominator = Polynomial([1.0, *distortion[list(model.denominator)]])
-    square = Polynomial([0.0, 1.0])
-    # d(r N / D) / dr = (D (N + 2 r^2 N') - 2 r^2 N D') / D^2
-    slope = denominator * (numerator + 2 * square * numerator.deriv()) - 2 * square * numerator * denominator.deriv()
-    roots = np.concatenate([each.trim(_NOTHING).roots() for each in (slope, denominator)])
+    # d(r N / D) / dr = (D (N + 2 r^2 N') - 2 r^2 N D') / D^2, with N and D by powers of r^2
+    numerator, denominator = (np.array([1.0, *distortion[list(each)]]) for each in (model.numerator, model.denominator))
+    odd, even = 1 + 2 * np.arange(len(numerator)), 2 * np.arange(len(denominator))
+    slope = np.convolve(denominator, odd * numerator) - np.convolve(numerator, even * denominator)
+    roots = np.concatenate([np.roots(_shortened(each)[::-1]) for each in (slope, denominator)])
     real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
     first = float(np.sqrt(real.min())) if len(real) else np.inf
     return min(first, np.pi) if model.is_equidistant else first
+
+
+def _shortened(coefficients: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
+    """Without the highest ones where they are nothing."""
+    some = np.flatnonzero(np.abs(coefficients) > _NOTHING)
+    return coefficients[: some[-1] + 1]

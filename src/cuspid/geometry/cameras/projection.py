@@ -8,9 +8,12 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float
 
+from cuspid.geometry.cameras.models import GRID
 from cuspid.runtime.kernels import kernel
 
-_OPENCV, _FULL_OPENCV, _OPENCV_FISHEYE = 0, 1, 2
+_OPENCV, _FULL_OPENCV, _OPENCV_FISHEYE, _SPLINED = 0, 1, 2, 4
+_REACH, _CONTROL = 8, 9
+"""Where the parameters of a splined lens have its reach and the first of its control points."""
 _STEPS, _SETTLED = 30, 1e-14
 """Of Newton's method for the inverse; and the step, in units of the ideal image, below which it ends."""
 _WRONG = 1e-9
@@ -33,7 +36,7 @@ def _radial(model, k, r2):
         radial = numerator / denominator
         by_r2 = k[4] + r2 * (2 * k[5] + r2 * 3 * k[8])
         return radial, (by_r2 - radial * (k[9] + r2 * (2 * k[10] + r2 * 3 * k[11]))) / denominator, denominator
-    third, fourth = (k[6], k[7]) if model == _OPENCV_FISHEYE else (k[8], k[9])
+    third, fourth = (k[6], k[7]) if model in (_OPENCV_FISHEYE, _SPLINED) else (k[8], k[9])
     factor = 1 + r2 * (k[4] + r2 * (k[5] + r2 * (third + r2 * fourth)))
     return factor, k[4] + r2 * (2 * k[5] + r2 * (3 * third + r2 * 4 * fourth)), 1.0
 
@@ -42,7 +45,7 @@ def _radial(model, k, r2):
 @no_type_check
 def _sideways(model, k):
     """p1, p2, s1, s2."""
-    if model == _OPENCV_FISHEYE:
+    if model in (_OPENCV_FISHEYE, _SPLINED):
         return 0.0, 0.0, 0.0, 0.0
     if model <= _FULL_OPENCV:
         return k[6], k[7], 0.0, 0.0
@@ -64,10 +67,60 @@ def _ideal(model, x, y, z):
 
 @kernel
 @no_type_check
+def _cell(at, reach):
+    """The first control point about a place along one side of the grid (the others follow), and how far it is beyond
+    the second one, in their distances."""
+    place = (at + reach) * (GRID - 3) / (2 * reach)
+    first = np.floor(place)
+    return int(first), place - first
+
+
+@kernel
+@no_type_check
+def _weight(point, s):
+    """Of one of the four control points about a place, for the cubic B-spline, and its derivative by the place."""
+    if point == 0:
+        return (1 - s) ** 3 / 6, -((1 - s) ** 2) / 2
+    if point == 1:
+        return (3 * s**3 - 6 * s**2 + 4) / 6, (3 * s**2 - 4 * s) / 2
+    if point == 2:
+        return (-3 * s**3 + 3 * s**2 + 3 * s + 1) / 6, (-3 * s**2 + 2 * s + 1) / 2
+    return s**3 / 6, s**2 / 2
+
+
+@kernel
+@no_type_check
+def _shift(k, u, v):
+    """By how much the grid of a splined lens shifts a place, then the derivatives of this by u and v: of the first by
+    both, then of the second."""
+    x = y = xu = xv = yu = yv = 0.0
+    per = (GRID - 3) / (2 * k[_REACH])
+    # What lies far out must not become a whole number that is none.
+    if not abs(u) < 4 * k[_REACH] or not abs(v) < 4 * k[_REACH]:
+        return x, y, xu, xv, yu, yv
+    column, s = _cell(u, k[_REACH])
+    row, t = _cell(v, k[_REACH])
+    for b in range(4):
+        for a in range(4):
+            if 0 <= row + b < GRID and 0 <= column + a < GRID:
+                wu, du = _weight(a, s)
+                wv, dv = _weight(b, t)
+                one = _CONTROL + (row + b) * GRID + column + a
+                other = one + GRID * GRID
+                x, xu, xv = x + wu * wv * k[one], xu + per * du * wv * k[one], xv + per * wu * dv * k[one]
+                y, yu, yv = y + wu * wv * k[other], yu + per * du * wv * k[other], yv + per * wu * dv * k[other]
+    return x, y, xu, xv, yu, yv
+
+
+@kernel
+@no_type_check
 def distorted(model, k, u, v):
     """Where a lens shows a place of the ideal one, before focal length and principal point."""
     r2 = u * u + v * v
     radial, _, _ = _radial(model, k, r2)
+    if model == _SPLINED:
+        x, y, _, _, _, _ = _shift(k, u, v)
+        return u * radial + x, v * radial + y
     p1, p2, s1, s2 = _sideways(model, k)
     return (
         u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + s1 * r2,
@@ -81,6 +134,10 @@ def _by_ideal(model, k, u, v):
     """Derivatives of :func:`distorted` by u and v: of the first by both, then of the second."""
     r2 = u * u + v * v
     radial, slope, _ = _radial(model, k, r2)
+    if model == _SPLINED:
+        _, _, xu, xv, yu, yv = _shift(k, u, v)
+        cross = 2 * u * v * slope
+        return radial + 2 * u * u * slope + xu, cross + xv, cross + yu, radial + 2 * v * v * slope + yv
     p1, p2, s1, s2 = _sideways(model, k)
     cross = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v
     return (
@@ -89,6 +146,25 @@ def _by_ideal(model, k, u, v):
         cross + 2 * s2 * u,
         radial + 2 * v * v * slope + 2 * p2 * u + 6 * p1 * v + 2 * s2 * v,
     )
+
+
+@kernel
+@no_type_check
+def _by_control(k, u, v, by_parameters):
+    """Derivatives by the reach and the control points of a splined lens."""
+    _, _, xu, xv, yu, yv = _shift(k, u, v)
+    by_parameters[0, _REACH] = -k[0] * (xu * u + xv * v) / k[_REACH]
+    by_parameters[1, _REACH] = -k[1] * (yu * u + yv * v) / k[_REACH]
+    if not abs(u) < 4 * k[_REACH] or not abs(v) < 4 * k[_REACH]:
+        return
+    column, s = _cell(u, k[_REACH])
+    row, t = _cell(v, k[_REACH])
+    for b in range(4):
+        for a in range(4):
+            if 0 <= row + b < GRID and 0 <= column + a < GRID:
+                weight = _weight(a, s)[0] * _weight(b, t)[0]
+                one = _CONTROL + (row + b) * GRID + column + a
+                by_parameters[0, one], by_parameters[1, one + GRID * GRID] = weight * k[0], weight * k[1]
 
 
 @kernel
@@ -132,9 +208,11 @@ def camera_jacobian(model, k, x, y, z, pixel, by_point, by_parameters):
     a, b = fx * u * r2 / divided, fy * v * r2 / divided
     by_parameters[0, 4], by_parameters[1, 4] = a, b
     by_parameters[0, 5], by_parameters[1, 5] = a * r2, b * r2
-    if model == _OPENCV_FISHEYE:
+    if model in (_OPENCV_FISHEYE, _SPLINED):
         by_parameters[0, 6], by_parameters[1, 6] = a * r2 * r2, b * r2 * r2
         by_parameters[0, 7], by_parameters[1, 7] = a * r2 * r2 * r2, b * r2 * r2 * r2
+        if model == _SPLINED:
+            _by_control(k, u, v, by_parameters)
         return
     by_parameters[0, 6], by_parameters[1, 6] = fx * 2 * u * v, fy * (r2 + 2 * v * v)
     by_parameters[0, 7], by_parameters[1, 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cuspid.model.camera import Camera
 from cuspid.model.rig import MountedCamera, Rig
 from cuspid.report.pages.page import number, picture_uri, provenance, render_page
 from cuspid.storage import CalibrationResult
@@ -41,13 +42,18 @@ def calibration_page(result: CalibrationResult) -> str:
     )
 
 
-_DIGITS = {"f": 1, "c": 1, "k": 4, "p": 5, "s": 5}
+_DIGITS = {"f": 1, "c": 1, "k": 4, "p": 5, "s": 5, "r": 3}
 """Of parameters, by the first letters of their names."""
 
 
 def _parameter_names(rig: Rig) -> list[str]:
     """Of all models of its lenses."""
-    return list(dict.fromkeys(name for each in rig.cameras.values() for name in each.camera.parameter_names))
+    return list(dict.fromkeys(name for each in rig.cameras.values() for name in _shown_names(each.camera)))
+
+
+def _shown_names(camera: Camera) -> tuple[str, ...]:
+    """Of its parameters, without the control points of a splined lens."""
+    return camera.parameter_names[: len(camera.parameters) - 2 * camera.lens.splined**2]
 
 
 def _lens(mounted: MountedCamera) -> dict[str, Any]:
@@ -56,7 +62,7 @@ def _lens(mounted: MountedCamera) -> dict[str, Any]:
     sigma = _sigmas(camera.covariance, len(camera.parameters))
     values = {
         name: f"{number(value, _DIGITS[name[0]])} ± {number(_is_known(each), _DIGITS[name[0]])}"
-        for name, value, each in zip(camera.parameter_names, camera.parameters, sigma, strict=True)
+        for name, value, each in zip(_shown_names(camera), camera.parameters, sigma, strict=False)
     }
     return {"model": camera.model, "values": values}
 

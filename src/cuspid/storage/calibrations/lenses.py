@@ -69,6 +69,7 @@ FISHEYE_TANGENTIAL = Lens(
     "THIN_PRISM_FISHEYE", ("k1", "k2", "p1", "p2", "k3", "k4"), "a fisheye with k1 k2 k3 k4 p1 p2"
 )
 THIN_PRISM = Lens("THIN_PRISM_FISHEYE", MODELS["THIN_PRISM_FISHEYE"].names, "a fisheye with thin prisms")
+SPLINED = Lens("SPLINED_FISHEYE", MODELS["SPLINED_FISHEYE"].names, "a splined fisheye")
 ALL = (BROWN_4, RATIONAL, FISHEYE, THIN_PRISM)
 
 

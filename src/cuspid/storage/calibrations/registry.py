@@ -16,7 +16,7 @@ from cuspid.runtime.inputs import read_text
 from cuspid.storage.calibrations import colmap, halcon, kalibr, matlab, metashape, nerfstudio, opencv, ros, tables
 from cuspid.storage.calibrations.documents import Document, parse
 from cuspid.storage.calibrations.fields import Calibration, Hints, scaled
-from cuspid.storage.calibrations.lenses import Lens, Loss, carried
+from cuspid.storage.calibrations.lenses import SPLINED, Lens, Loss, carried
 from cuspid.storage.files import finished, reading, whole_files, write_bytes
 from cuspid.storage.handpieces import handpiece_of_rig, write_handpiece
 from cuspid.storage.units import MM_PER_UNIT, Unit
@@ -53,7 +53,7 @@ class Format:
 
 FORMATS: Mapping[Name, Format] = {
     "handpiece": Format(
-        title="cuspid's handpiece.json", unit="mm", tells_unit=True, lenses=colmap.LENSES,
+        title="cuspid's handpiece.json", unit="mm", tells_unit=True, lenses=(*colmap.LENSES, SPLINED),
         recognises=colmap.recognises_handpiece, read=colmap.read_handpiece, write=None,
     ),
     "colmap-rig": Format(
