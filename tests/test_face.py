@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from urllib.request import urlopen
 
 import cv2
 import numpy as np
@@ -232,3 +233,19 @@ def test_a_notebook_shows_a_picture(capture: cuspid.Capture, truth: GroundTruth,
         (encoded,) = re.findall(r'base64,([^"]+)"', html)
         image = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), dtype=np.uint8), cv2.IMREAD_COLOR)
         assert image.std() > 5, type(value)
+
+
+def test_a_mesh_a_jaw_and_a_handpiece_are_shown_in_the_browser(
+    truth: GroundTruth, capture: cuspid.Capture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'cuspid[view]'")
+    for value in (truth.jaw.mesh, truth.jaw, truth.handpiece):
+        server = value.show(port=18090)
+        try:
+            told = capsys.readouterr().out
+            assert f"http://127.0.0.1:{server.get_port()} shows {type(value).__name__}(" in told
+            with urlopen(f"http://127.0.0.1:{server.get_port()}", timeout=20) as answer:
+                assert answer.status == 200
+        finally:
+            server.stop()
+    assert not hasattr(capture, "show")

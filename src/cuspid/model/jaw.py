@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from cuspid.geometry import read_only
 from cuspid.model.mesh import Mesh
-from cuspid.runtime.display import Displayed
+from cuspid.runtime.display import Viewable
 from cuspid.runtime.errors import InputError
 
 Arch = Literal["lower", "upper"]
@@ -62,7 +62,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Jaw(Displayed):
+class Jaw(Viewable):
     """What is scanned, or the reference that a scan is evaluated against."""
 
     mesh: Mesh

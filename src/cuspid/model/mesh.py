@@ -16,7 +16,7 @@ from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int, UInt8
 
 from cuspid.geometry import Rigid3, owned, read_only
-from cuspid.runtime.display import Displayed
+from cuspid.runtime.display import Viewable
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.workers import computed_once, map_slices
@@ -111,7 +111,7 @@ def _backwards(points, towards, tolerance_mm):
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh(Displayed):
+class Mesh(Viewable):
     """Vertices and triangles."""
 
     vertices: Float[np.ndarray, "v 3"]

@@ -18,7 +18,7 @@ from cuspid.geometry import Rigid3, axes_about, read_only, unit
 from cuspid.model.body import CAMERA_MM, LED_MM, Body, module
 from cuspid.model.camera import Camera
 from cuspid.model.shutter import PLAIN, Shutter
-from cuspid.runtime.display import Displayed
+from cuspid.runtime.display import Viewable
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.values import checked_name, named, one_line, shown
 from cuspid.runtime.workers import computed_once
@@ -294,7 +294,7 @@ def depth_of_field_mm(working_distance_mm: float) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Handpiece(Displayed):
+class Handpiece(Viewable):
     """Everything that is built into the handpiece."""
 
     rig: Rig

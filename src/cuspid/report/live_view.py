@@ -6,13 +6,17 @@ The frame is that of the page of the same folder (mm).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import singledispatch
 from typing import Any
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 
+from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
+from cuspid.model.rig import Handpiece
 from cuspid.model.shape_model import ShapeModel
 from cuspid.report.pages.color_scale import ColorScale
 from cuspid.report.pages.scene import (
@@ -25,7 +29,8 @@ from cuspid.report.pages.scene import (
     shown_frame,
     surface_maps,
 )
-from cuspid.report.same_origin import only_own_pages, require_address
+from cuspid.report.same_origin import address, only_own_pages, require_address
+from cuspid.runtime.display import Viewable
 from cuspid.runtime.errors import InputError, MissingDependencyError
 from cuspid.storage import Result, ScanResult, ShapeResult
 
@@ -36,6 +41,12 @@ Node = Any
 _MOST_MODES = 5
 _GAMMA = 2.2
 _NO_COLORS = "None"
+LOCAL = "127.0.0.1"
+_CAMERA_SHARE = 0.3
+"""Of the working distance, the depth of the frustum by which a camera is shown."""
+_LIGHT_COLOR = (255, 200, 60)
+_FROM = np.array([2.0, -3.0, -2.5])
+"""From where a handpiece is seen first, in working distances."""
 
 
 def serve(result: Result, host: str, port: int) -> Server:
@@ -65,6 +76,56 @@ def start(host: str, port: int) -> Server:
     server.scene.configure_environment_map(None)
     server.scene.configure_default_lights(enabled=False)
     return server
+
+
+def show_value(value: Viewable, port: int) -> Server:
+    """A server for this machine alone that shows a mesh, a jaw or a handpiece; its address is printed.
+
+    Raises MissingDependencyError without viser, TypeError for another value.
+    """
+    server = start(LOCAL, port)
+    server.scene.set_up_direction("+z")
+    _light(server)
+    _add_value(value, server)
+    print(f"{address(LOCAL, server.get_port())} shows {value!r}")
+    return server
+
+
+@singledispatch
+def _add_value(value: object, server: Server) -> None:
+    raise TypeError(f"there is no view of a {type(value).__name__}")
+
+
+@_add_value.register
+def _(value: Mesh, server: Server) -> None:
+    add(server, "/mesh", value, _plain(value, PLASTER_COLOR) if value.colors is None else value.colors, visible=True)
+    _look_down_on(server, value)
+
+
+@_add_value.register
+def _(value: Jaw, server: Server) -> None:
+    _add_value(value.mesh, server)
+
+
+@_add_value.register
+def _(value: Handpiece, server: Server) -> None:
+    size = value.working_distance_mm * _CAMERA_SHARE
+    for name, mounted in value.rig.cameras.items():
+        camera, rig_from_cam = mounted.camera, mounted.cam_from_rig.inverse()
+        server.scene.add_camera_frustum(
+            f"/cameras/{name}",
+            fov=2 * float(np.arctan(camera.height / (2 * camera.focal_px[1]))),
+            aspect=camera.width / camera.height,
+            scale=size,
+            wxyz=Rotation.from_matrix(rig_from_cam.rotation).as_quat(scalar_first=True),
+            position=rig_from_cam.translation,
+        )
+        server.scene.add_label(f"/cameras/{name}/name", name)
+    for name, light in value.lights.items():
+        server.scene.add_icosphere(f"/lights/{name}", radius=size / 8, position=light.position_mm, color=_LIGHT_COLOR)
+    middle = np.mean([mounted.cam_from_rig.inverse().translation for mounted in value.rig.cameras.values()], axis=0)
+    server.initial_camera.look_at = tuple(map(float, middle))
+    server.initial_camera.position = tuple(map(float, middle + _FROM * value.working_distance_mm))
 
 
 def _what_to_show(result: Result) -> Callable[[Server], None]:
