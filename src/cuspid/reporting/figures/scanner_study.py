@@ -111,7 +111,7 @@ def _draw_boxes(axes: Axes, scans: Rows, names: Sequence[str], column: str, labe
     axes.set_xticks(range(1, len(names) + 1), [_short(name) for name in names], rotation=35, ha="right")
     axes.set_title(label, fontsize=7.5, loc="left", color=_INK)
     if min(min(group, default=0) for group in groups) >= 0:
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.06 * max(max(group, default=0) for group in groups) or 1.0)
     else:
         axes.axhline(0, color=_SOFT, linewidth=0.6)
     _plain(axes)
