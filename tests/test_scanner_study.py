@@ -9,10 +9,11 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import KDTree
 
 from cuspid import storage
 from cuspid.evaluation.alignments import align_points
-from cuspid.evaluation.deformation import bend, straighten
+from cuspid.evaluation.deformation import bend, fit_deformation, straighten
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import best_motion, deviations_um, scatter
 from cuspid.evaluation.registration import RegistrationOptions
@@ -253,6 +254,14 @@ def test_a_bend_is_taken_back(spread, twist, ppm):
     bent = bend(curve, told, points)
     assert np.abs(straighten(curve, told, bent) - points).max() < 1e-5
     assert 0.005 < np.abs(bent - points).max() < 1
+
+
+@pytest.mark.parametrize(("share", "is_told"), [(0.7, True), (0.3, False)])
+def test_modes_are_not_told_of_a_small_part_of_the_arch(jaw, specimen, share, is_told):
+    curve = specimen.arch_curve
+    along = curve.lengths_mm[KDTree(curve.points[:, :2]).query(specimen.places.points[:, :2])[1]]
+    part = specimen.places.chosen(along < share * curve.lengths_mm[-1])
+    assert (fit_deformation(part, curve, specimen.reference_surface) is not None) == is_told
 
 
 # --- a whole study ----------------------------------------------------------------------------------------------------

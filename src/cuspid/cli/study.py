@@ -223,5 +223,6 @@ def _print(told: Mapping[str, Any]) -> None:
 def _estimate(found: Mapping[str, Any] | None) -> str:
     if found is None:
         return "-"
-    interval = "" if found["low"] is None else f" ({found['low']:.1f} to {found['high']:.1f})"
-    return f"{found['value']:.1f}{interval}"
+    digits = 2 if abs(found["value"]) < 2 else 1
+    interval = "" if found["low"] is None else f" ({found['low']:.{digits}f} to {found['high']:.{digits}f})"
+    return f"{found['value']:.{digits}f}{interval}"

@@ -38,6 +38,7 @@ BESIDE_MM = 12.0
 """Places farther beside the curve have no part in the fit: a palate or a base says little of the arch."""
 _ROUNDS, _SETTLED_UM = 20, 0.01
 _LEAST_PLACES = 300
+_LEAST_SHARE = 0.5
 _STRAIGHTENINGS = 3
 
 
@@ -97,13 +98,18 @@ def straighten(
 
 
 def fit_deformation(places: Places, curve: ArchCurve, scan: SignedDistance) -> Deformation | None:
-    """The modes of an aligned scan, fitted to places that it shows; None where these are too few.
+    """The modes of an aligned scan, fitted to places that it shows; None where these are too few, or beside less than
+    half of the arch, of which they would tell by extrapolation.
 
     ``curve`` and ``places`` are those of the reference, in its occlusal frame.
     """
-    beside_mm = KDTree(curve.points[:, :2]).query(places.points[:, :2])[0]
-    used = places.chosen(beside_mm <= BESIDE_MM)
+    beside_mm, nearest = KDTree(curve.points[:, :2]).query(places.points[:, :2])
+    beside = beside_mm <= BESIDE_MM
+    used = places.chosen(beside)
     if len(used.points) < _LEAST_PLACES:
+        return None
+    first_mm, last_mm = np.percentile(curve.lengths_mm[nearest[beside]], [2, 98])
+    if last_mm - first_mm < _LEAST_SHARE * curve.lengths_mm[-1]:
         return None
     fields = mode_fields(curve, used.points)
     rigid = _rigid_fields(used.points)

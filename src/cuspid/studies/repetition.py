@@ -129,7 +129,7 @@ def scan_again(*, seed: int, folder: Path, options: RepeatOptions, trial: TrialO
     jaw = storage.read_jaw(folder / "jaw.ply")
     handpiece = storage.read_handpiece(folder / "handpiece.json")
     name = f"scan-{seed - trial.simulation.seed}"
-    scratch = folder / "scratch" / name
+    scratch = folder / "meshes" / name
     try:
         done = run_trial(
             lambda out: shoot_again(jaw, handpiece, out, options, trial.simulation, seed=seed),

@@ -30,6 +30,8 @@ _INK, _SOFT = "#333333", "#8795a3"
 _COLORS = ("#0b6e78", "#d9480f", "#5f3dc4", "#2b8a3e", "#c2255c", "#1971c2", "#e67700", "#495057")
 """Of scanners, in their order; they stay apart for most who do not see all colours."""
 _DPI = 300
+_FEW_SPANS = 100
+"""Fewer distances are drawn larger."""
 _MOST_MAPS = 144
 _TRUENESS = {
     "mean_abs_um": "trueness: mean |d| / µm",
@@ -111,7 +113,7 @@ def _draw_boxes(axes: Axes, scans: Rows, names: Sequence[str], column: str, labe
     axes.set_xticks(range(1, len(names) + 1), [_short(name) for name in names], rotation=35, ha="right")
     axes.set_title(label, fontsize=7.5, loc="left", color=_INK)
     if min(min(group, default=0) for group in groups) >= 0:
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.06 * max(max(group, default=0) for group in groups) or 1.0)
     else:
         axes.axhline(0, color=_SOFT, linewidth=0.6)
     _plain(axes)
@@ -169,8 +171,9 @@ def _draw_spans(axes: Axes, rows: Rows, names: Sequence[str], name: str) -> None
     nominal, error = (np.array([row[column] for row in rows]) for column in ("nominal_mm", "error_um"))
     slope = float(nominal @ error / (nominal @ nominal))
     color = color_of(names, name)
+    size, alpha = (3.0, 0.7) if len(rows) < _FEW_SPANS else (1.8, 0.35)
     axes.plot(
-        nominal, error, "o", color=color, markersize=1.8, alpha=0.35, markeredgewidth=0, rasterized=len(rows) > 4000
+        nominal, error, "o", color=color, markersize=size, alpha=alpha, markeredgewidth=0, rasterized=len(rows) > 4000
     )
     ends = np.array([0.0, nominal.max()])
     axes.plot(ends, slope * ends, color=color, linewidth=1.2, label=f"{_short(name)}: {1000 * slope:+.0f} ppm")
@@ -185,7 +188,7 @@ def limits_of_agreement(agreements: Rows) -> Figure | None:
         return None
     across = min(2, len(agreements))
     down = -(-len(agreements) // across)
-    figure = new_figure(7.2 if across > 1 else 4.8, 0.2 + 2.6 * down, dpi=_DPI, layout="constrained")
+    figure = new_figure(7.2, 0.2 + 2.6 * down, dpi=_DPI, layout="constrained")
     for k, found in enumerate(agreements, start=1):
         axes = figure.add_subplot(down, across, k)
         axes.plot(
@@ -233,7 +236,8 @@ def maps(views: Sequence[SpecimenView], *, means: bool) -> Figure | None:
     if not chosen:
         return None
     options = _options(common_range_um(views))
-    across = min(len(chosen), 3 if means else 6)
+    # A row for each specimen, where the means have room in it.
+    across = min(len(chosen), (views[0].means if 2 <= views[0].means <= 4 else 3) if means else 6)
     down = -(-len(chosen) // across)
     width_in = 7.2
     side_in = width_in / across

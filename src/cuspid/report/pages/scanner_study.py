@@ -44,6 +44,7 @@ _KINDS = {
     "teeth": "teeth (centroids)",
     "stations": "stations along the arch",
 }
+_SMALL = 2.0
 Table = dict[str, Any]
 
 
@@ -144,14 +145,19 @@ def _first(view: SpecimenView) -> np.ndarray:
 
 
 def _estimate(found: Mapping[str, Any] | None, digits: int = 1, *, plus: bool = False) -> str:
-    """A value with its interval."""
+    """A value with its interval; of a small one, a digit more."""
     if found is None:
         return "–"
+    digits += bool(digits) and abs(found["value"]) < _SMALL
     told = (signed if plus else number)(found["value"], digits)
     if found["low"] is None:
         return told
     show = signed if plus else number
     return f"{told} ({show(found['low'], digits)} to {show(found['high'], digits)})"
+
+
+def _size(value: float | None) -> str:
+    return number(value, 2 if value is not None and abs(value) < _SMALL else 1)
 
 
 def _signed(figure: str) -> bool:
@@ -294,7 +300,7 @@ def _groups_table(groups: Sequence[Mapping[str, Any]]) -> Table:
         "systematic_rms_um": "systematic, RMS",
     }
     rows = [
-        [f"{row['scanner']} – {row['specimen']}", str(row["scans"]), *(number(row[column]) for column in columns)]
+        [f"{row['scanner']} – {row['specimen']}", str(row["scans"]), *(_size(row[column]) for column in columns)]
         for row in groups
     ]
     return {
