@@ -29,6 +29,7 @@ from cuspid.calibration.bundle import BoardScene, common_free
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.lenses import choose_lens
+from cuspid.calibration.uncertainty import lens_difference_px, projection_sigma_px
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
 from cuspid.model.camera import Camera
@@ -342,6 +343,16 @@ def calibrated_half(
 def difference(name: str, one: RigCalibration, other: RigCalibration) -> dict[str, Value]:
     """Between the lenses of a camera, in what both state; and along which axis it is largest."""
     ours, theirs = one.rig[name].camera, other.rig[name].camera
+    if ours.lens.splined:  # each half has a grid of its own
+        off = np.linalg.norm(lens_difference_px(ours, theirs, one.pixels[name]), axis=2)
+        along = off / np.hypot(projection_sigma_px(ours), projection_sigma_px(theirs)) / np.sqrt(2)
+        known = along[np.isfinite(along)]
+        return {
+            "z": rms(known),
+            "worst_z": float(known.max()),
+            "worst_axis": "over the image",
+            "widened": max(one.widened[name], other.widened[name]),
+        }
     covariance = np.asarray(ours.covariance) + np.asarray(theirs.covariance)
     along, axes = whitened(ours.parameters - theirs.parameters, covariance)
     worst = int(np.argmax(np.abs(along)))

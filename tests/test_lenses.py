@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from boards import BOARD, LENSES_OF, SIZE, before_lens, views_of
+from boards import BOARD, LENSES_OF, SIZE, before_lens, moving, rolling_views, views_of
 from cuspid.calibration.bundle import BoardScene, mounted_cameras
 from cuspid.calibration.calibrate import calibrate_rig
 from cuspid.calibration.lenses import as_model, choose_lens, with_spline
@@ -60,6 +60,18 @@ def test_a_lens_that_no_polynomial_follows_is_splined_and_as_uncertain_as_stated
     in_sigmas = np.linalg.norm(off, axis=2) / projection_sigma_px(found.rig["cam"].camera) / np.sqrt(2)
     assert 0.5 < np.sqrt(np.nanmean(in_sigmas**2)) < 1.4
     assert 0.5 < found.cameras["cam"].parameters_apart < 1.3
+
+
+@pytest.mark.long
+def test_a_rolling_shutter_is_not_taken_for_a_richer_lens() -> None:
+    """It shifts rows in a film to the same side from view to view; lenses are judged once that is accounted for."""
+    truth = moving(0)
+    truth = replace(truth, cameras={"cam0": truth.cameras["cam0"]}, cam_from_rig={"cam0": Rigid3.identity()})
+    views = rolling_views(truth, {"cam0": 0.5}, {}, 0.05, np.random.default_rng(0))
+    found = calibrate_rig(views, {"cam0": SIZE}, BOARD)
+    assert found.lenses["cam0"].model == "OPENCV"
+    assert found.cameras["cam0"].readout == pytest.approx(0.5, abs=0.02)
+    assert found.cameras["cam0"].held_out_px < 0.06
 
 
 def test_a_splined_lens_that_is_asked_for_is_its_base_where_nothing_was_seen() -> None:

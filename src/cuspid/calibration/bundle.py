@@ -55,7 +55,7 @@ _LENSES, _CAMERAS, _BOARDS, _BENDINGS, _SHAPES, _MOUNTS, _CAMERA_DELAYS, _READOU
 _RADIAL_SIGMA, _SIDEWAYS_SIGMA = 0.5, 0.01
 """Standard deviation of radial, and of tangential and prism parameters about 0, for lenses as they are made: it matters
 only where the images do not decide. Radial terms beyond the second may do as much at the corner of the image."""
-_CONTROL_PX = 2.0
+_CONTROL_PX = 1.0
 """Standard deviation of what a control point of a splined lens shifts places by."""
 _CENTRE_SHARE = 0.05
 """Standard deviation of the principal point about the image centre, as a share of the image width."""

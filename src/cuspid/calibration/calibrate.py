@@ -4,7 +4,7 @@ result on views that were not used for it."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
@@ -30,7 +30,7 @@ from cuspid.calibration.bundle import (
 from cuspid.calibration.circle_centres import centre_shifts
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, split_by_board
 from cuspid.calibration.joining import joined_boards
-from cuspid.calibration.lenses import LensChoice, LensName, choose_lens
+from cuspid.calibration.lenses import LensChoice, LensName, choose_lens, splined_where_earned
 from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, renumbered, require_one_group
 from cuspid.calibration.timing import adjust_scene, follow_each_other, rolling, untied
 from cuspid.geometry import Rigid3
@@ -211,30 +211,62 @@ def _calibrate_once(
     else:
         start, common = joined(views, board, cameras, sorted({instant for _, instant in views}))
 
-    def tried(scene: BoardScene) -> _Trial:
+    def tried(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
         found, chosen, notes = _fit_cameras(scene, common, board, options)
-        return _Trial(found, _describe(found, chosen, board, choices, (*how, *notes)))
+        return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes)))
 
-    best = tried(start)
+    best = _with_timing(tried(start), start, common, board, options, tried)
+    splined = _splined(best, choices, board) if options.lens == "auto" else {}
+    if splined:
+        scene = best.found.scene
+        cameras = {**scene.cameras, **{name: camera for name, (_, camera) in splined.items()}}
+        poses = {**start.rig_from_board, **scene.rig_from_board}
+        scene = replace(scene, cameras=cameras, rig_from_board=poses, loose_px=0.0, shape=None)
+        with suppress(ReconstructionError):  # together with the other cameras
+            better = tried(scene, {**choices, **{name: choice for name, (choice, _) in splined.items()}})
+            best = better if _keeps_most(better.described, best.described) else best
+    return best.described
+
+
+def _splined(best: _Trial, choices: Mapping[str, LensChoice], board: Target) -> dict[str, tuple[LensChoice, Camera]]:
+    """Cameras whose views call for a splined lens, once it is known when each row was exposed."""
+    views, found = at_middle_rows(best.found.scene, best.described.views, board), {}
+    for name, camera in best.found.scene.cameras.items():
+        own = [part for (one, _), view in views.items() if one == name for part in split_by_board(view, board)]
+        splined = splined_where_earned(choices[name], camera, own, board)
+        if splined is not None:
+            found[name] = splined
+    return found
+
+
+def _with_timing(
+    best: _Trial,
+    start: BoardScene,
+    common: Views,
+    board: Target,
+    options: CalibrationOptions,
+    tried: Callable[[BoardScene], _Trial],
+) -> _Trial:
+    """With delays of the cameras and readouts, where these explain more."""
     frame = frame_numbers(start.rig_from_board)
     if frame is None or not follow_each_other(frame):
-        return best.described
+        return best
 
     def may_roll(scene: BoardScene, used: Views) -> bool:
         return options.shutter == "auto" and readout_score(rolling(scene, frame, used), used, board) > _ROLLING
 
     doubtful = any(_is_doubtful_together(check) for check in best.described.cameras.values())
-    if len(sizes) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
+    if len(start.cameras) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
         with suppress(ReconstructionError):  # the images do not tell delays as well
             apart = tried(untied(start, frame, common))
             best = apart if _is_better(apart.described, best.described) else best
     if not may_roll(best.found.scene, best.described.views):
-        return best.described
+        return best
     scene = replace(best.found.scene, rig_from_board={**start.rig_from_board, **best.found.scene.rig_from_board})
     with suppress(ReconstructionError):  # nor readouts
         rolled = tried(rolling(replace(scene, loose_px=0.0, shape=None), frame, common))
         best = rolled if _rolls(rolled, board) and _keeps_most(rolled.described, best.described) else best
-    return best.described
+    return best
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ standard errors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -85,8 +84,7 @@ def choose_lens(
     sound = _sound(views, simple)
     if len(sound) < 2 * LEAST_VIEWS:
         return choice, simple
-    spread = np.unique(np.linspace(0, len(sound) - 1, _MOST_VIEWS).astype(int))
-    some = [sound[k] for k in spread]
+    some = _some(sound)
     found, squares = dict[str, Adjusted](), dict[str, Float[np.ndarray, "v"]]()
     for model in _LADDER:
         if model == _LADDER[-1] and not _is_worth_more(squares):
@@ -98,13 +96,11 @@ def choose_lens(
             continue
     if not squares:
         return choice, simple
-    chosen = _simplest_best(squares)
-    if _common_pattern(found[chosen], some) > _PATTERN:
-        with suppress(ReconstructionError):
-            found[_SPLINED] = calibrated_as(_SPLINED, some, board, size, found.get(_LADDER[0]))
-            squares[_SPLINED] = _held_out(found[_SPLINED], some, board)
-            chosen = _simplest_best(squares)
-    rms = {model: float(np.sqrt(np.mean(each[np.isfinite(each)]))) for model, each in squares.items()}
+    chosen = next(iter(squares))
+    for model in list(squares)[1:]:
+        if _is_better(squares[model], squares[chosen]):
+            chosen = model
+    rms = {model: _rms(each) for model, each in squares.items()}
     others = [model for model in rms if model != chosen]
     richer = [model for model in others if _size(found[model]) > _size(found[chosen])]
     rival = min(richer or others, key=rms.__getitem__, default=None)
@@ -123,13 +119,41 @@ def choose_lens(
     return taken, alone
 
 
-def _simplest_best(squares: Mapping[str, Float[np.ndarray, "v"]]) -> str:
-    """The first model that no later one beats."""
-    chosen = next(iter(squares))
-    for model in list(squares)[1:]:
-        if _is_better(squares[model], squares[chosen]):
-            chosen = model
-    return chosen
+def splined_where_earned(
+    choice: LensChoice, camera: Camera, views: Sequence[BoardView], board: Target
+) -> tuple[LensChoice, Camera] | None:
+    """A splined lens instead of a camera's, where its views call for it; they are as if all rows were exposed at once,
+    for a readout leaves a pattern, too. None where they do not.
+
+    What is left out at a time are views that follow each other: in a film the next one is almost the same.
+    """
+    some, size = _some(views), (camera.width, camera.height)
+    if len(some) < 2 * LEAST_VIEWS:
+        return None
+    try:
+        base = calibrated_alone(some, board, size, [camera])
+        if _common_pattern(base, some) <= _PATTERN:
+            return None
+        splined = calibrated_as(_SPLINED, some, board, size)
+        before, after = (_held_out(each, some, board, runs=True) for each in (base, splined))
+    except ReconstructionError:  # not such a lens
+        return None
+    if not _is_better(after, before):
+        return None
+    found = splined.scene.cameras[""]
+    held_out = {**choice.held_out_px, camera.model: _rms(before), _SPLINED: _rms(after)}
+    rival = base.scene.cameras[""]
+    return LensChoice(model=_SPLINED, held_out_px=held_out, chosen=found, rival=rival), found
+
+
+def _some(views: Sequence[BoardView]) -> list[BoardView]:
+    """Not too many of some views, evenly."""
+    return [views[k] for k in np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).astype(int))]
+
+
+def _rms(squares: Float[np.ndarray, "v"]) -> float:
+    """Of those that are known."""
+    return float(np.sqrt(np.mean(squares[np.isfinite(squares)])))
 
 
 def _common_pattern(found: Adjusted, views: Sequence[BoardView]) -> float:
@@ -240,15 +264,18 @@ def _ideal(model: str, size: tuple[int, int], half_deg: float) -> Camera:
     )
 
 
-def _held_out(found: Adjusted, views: Sequence[BoardView], board: Target) -> Float[np.ndarray, "v"]:
-    """Mean square of the residuals of each view by cameras that were calibrated without it; NaN where the view fits no
-    camera, infinite where such a camera does not show all of it. Raises ReconstructionError where too few views are
-    left."""
+def _held_out(
+    found: Adjusted, views: Sequence[BoardView], board: Target, *, runs: bool = False
+) -> Float[np.ndarray, "v"]:
+    """Mean square of the residuals of each view by cameras that were calibrated without it, and without every fourth
+    one or, with ``runs``, the quarter that it lies in; NaN where the view fits no camera, infinite where such a camera
+    does not show all of it. Raises ReconstructionError where too few views are left."""
     scene, count = found.scene, len(views)
     named = {("", instant): views[int(instant)] for instant in scene.rig_from_board}
     squares = np.full(count, np.nan)
     for fold in range(_FOLDS):
-        out = {key: view for key, view in named.items() if int(key[1]) % _FOLDS == fold}
+        number = {key: _FOLDS * int(key[1]) // count if runs else int(key[1]) % _FOLDS for key in named}
+        out = {key: view for key, view in named.items() if number[key] == fold}
         rest = {key: view for key, view in named.items() if key not in out}
         if not out:
             continue
