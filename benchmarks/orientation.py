@@ -28,7 +28,7 @@ from cuspid.jaw import GUM, Jaw
 from cuspid.mesh import Mesh
 from cuspid.storage import MESH_SUFFIXES, write_json
 
-DEVELOPED_ON = ("001", "005", "010", "029", "067", "fullarch")
+DEVELOPED_ON = ("001", "005", "010", "029", "067", "fullarch", "_LOWER")
 """In the names of jaws whose quadrants were looked at while the law was made; the others only at the end."""
 WITHIN_DEG = 25.0
 """A frame that is farther off is a wrong one."""
