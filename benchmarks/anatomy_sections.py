@@ -208,6 +208,7 @@ def orientation(result: Result) -> str:
                 ("jaw", "tilt", "largest", "turn", "largest", "doubted", "crowns up and front first by labels"), rows
             ),
             "",
+            *([f"These are of commit {result['jaws_of_commit']}.", ""] if "jaws_of_commit" in result else []),
             "Quadrants cut from those with labels, 3 mm of gum around them, against the jaw that they are of; all are "
             "to be doubted in one line:",
             "",

@@ -28,7 +28,7 @@ from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import CuspidError
 from cuspid.storage import MESH_SUFFIXES, write_json
 
-DEVELOPED_ON = ("001", "005", "010", "029", "067", "fullarch")
+DEVELOPED_ON = ("001", "005", "010", "029", "067", "fullarch", "_LOWER")
 """In the names of jaws whose quadrants were looked at while the law was made; the others only at the end."""
 WITHIN_DEG = 25.0
 """A frame that is farther off is a wrong one."""
@@ -72,15 +72,15 @@ def tried(mesh: Mesh, count: int, seed: int) -> Found:
 
 
 def labels_agree(jaw: Jaw) -> bool | None:
-    """Whether crowns look up and front teeth lie in front of molars; None where no teeth are told."""
+    """Whether crowns stand out of the gum and front teeth lie in front of molars; None where no teeth are told."""
     teeth = jaw.face_labels
     if teeth is None:
         return None
-    mesh = jaw.mesh
-    up = mesh.face_areas[teeth != GUM] @ mesh.face_normals[teeth != GUM]
-    front, back = (mesh.face_centres[np.isin(teeth % 10, places) & (teeth != GUM)] for places in (_FRONT, _BACK))
+    places = jaw.mesh.face_centres
+    above = np.median(places[teeth != GUM, 2]) > np.median(places[teeth == GUM, 2]) if (teeth == GUM).any() else True
+    front, back = (places[np.isin(teeth % 10, each) & (teeth != GUM)] for each in (_FRONT, _BACK))
     ahead = front.mean(axis=0)[1] > back.mean(axis=0)[1] if len(front) and len(back) else True
-    return bool(up[2] > 0 and ahead)
+    return bool(above and ahead)
 
 
 def quadrants_of(jaw: Jaw) -> Iterator[tuple[int, Mesh]]:

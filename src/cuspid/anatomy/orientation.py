@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from cuspid.geometry import Rigid3, axes_about, best_similarity, unit
 from cuspid.model.facing import pieces_of
 from cuspid.model.mesh import Mesh
-from cuspid.model.occlusal_plane import crown_tips, crown_tops, levelled, upright
+from cuspid.model.occlusal_plane import SPEE_MM, crown_tips, crown_tops, levelled, upright
 from cuspid.runtime.errors import InputError
 from cuspid.storage import MM_PER_UNIT, Unit
 
@@ -52,6 +52,8 @@ _PART_NOTE = (
     "occlusal frame: unsure which way is up and which anterior, as this does not look like a whole arch; check the "
     "picture"
 )
+_PART_OFF_PLANE_MM = 10.0
+"""So much higher or lower than most the tips of a part of an arch may lie, which is seen at a tilt."""
 _SECOND_JAW = 0.4
 """Least surface of one of two jaws, as a share of that of the other one."""
 _TOWARDS = 0.6
@@ -82,17 +84,19 @@ class _Relief:
     """First surface under each place of the grid, mm; NaN where there is none or only its back is seen."""
     normals: Float[np.ndarray, "h w 3"]
     """Normal there."""
+    off_plane_mm: float
+    """How much higher or lower than most the tips of its crowns may lie."""
 
     def crowns(self) -> Float[np.ndarray, "n 3"]:
         """Points of the tops of the crowns. What else stands as high, a trimmed base or the gum behind the last tooth,
         is smooth."""
-        tops = crown_tops(self.points[..., 2], _GRID_MM)
+        tops = crown_tops(self.points[..., 2], _GRID_MM, off_plane_mm=self.off_plane_mm)
         rough = tops & self.rough()
         return np.asarray(self.points[rough if rough.any() else tops])
 
     def edges(self) -> Float[np.ndarray, "n 3"]:
         """Points of the crowns just below their tips."""
-        return np.asarray(self.points[crown_tops(self.points[..., 2], _GRID_MM, _EDGE_MM)])
+        return np.asarray(self.points[crown_tops(self.points[..., 2], _GRID_MM, _EDGE_MM, self.off_plane_mm)])
 
     def rough(self) -> Bool[np.ndarray, "h w"]:
         """Where the normals of the surroundings point apart, which shortens their mean."""
@@ -105,7 +109,7 @@ class _Relief:
 
     def tips(self) -> Float[np.ndarray, "n 3"]:
         """Points that are the highest of their surroundings."""
-        return np.asarray(self.points[crown_tips(self.points[..., 2], _GRID_MM)])
+        return np.asarray(self.points[crown_tips(self.points[..., 2], _GRID_MM, off_plane_mm=self.off_plane_mm)])
 
 
 def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
@@ -123,7 +127,7 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     if not (wide and one_way):
         notes = (*notes, _PART_NOTE)
     if not wide:
-        relief, level = _level_frame(mesh, _roughest(mesh, start), _PART_TILT_SD_DEG)
+        relief, level = _level_frame(mesh, _roughest(mesh, start), _PART_TILT_SD_DEG, _PART_OFF_PLANE_MM)
         crowns = relief.crowns()
         anterior = _anterior_of_part(crowns[:, :2], relief.edges()[:, :2])
     centre = np.array([*crowns[:, :2].mean(axis=0), relief.tips()[:, 2].mean()])
@@ -186,7 +190,7 @@ def _width_mm(places: Float[np.ndarray, "n 2"]) -> float:
     return float(np.ptp(places @ axes.T, axis=0).min())
 
 
-def _relief(mesh: Mesh, frame: Rigid3) -> _Relief:
+def _relief(mesh: Mesh, frame: Rigid3, off_plane_mm: float = SPEE_MM) -> _Relief:
     """The mesh seen from +Z of ``frame``."""
     seen = frame.apply(mesh.vertices)
     lower, upper = seen.min(axis=0), seen.max(axis=0)
@@ -198,7 +202,7 @@ def _relief(mesh: Mesh, frame: Rigid3) -> _Relief:
     unseen = ~(normals[:, 2] > 0)
     points = eyes.reshape(-1, 3) - np.where(unseen, np.nan, hits.distances)[:, None] * np.array([0, 0, 1.0])
     points[unseen], normals[unseen] = np.nan, np.nan
-    return _Relief(points=points.reshape(eyes.shape), normals=normals.reshape(eyes.shape))
+    return _Relief(points=points.reshape(eyes.shape), normals=normals.reshape(eyes.shape), off_plane_mm=off_plane_mm)
 
 
 def _roughness(relief: _Relief) -> float:
@@ -209,10 +213,12 @@ def _roughness(relief: _Relief) -> float:
     return float(np.arccos(np.clip(cosines[known], -1, 1)).mean()) if known.any() else 0.0
 
 
-def _level_frame(mesh: Mesh, start: Rigid3, tilt_sd_deg: float = _TILT_SD_DEG) -> tuple[_Relief, Rigid3]:
+def _level_frame(
+    mesh: Mesh, start: Rigid3, tilt_sd_deg: float = _TILT_SD_DEG, off_plane_mm: float = SPEE_MM
+) -> tuple[_Relief, Rigid3]:
     """A frame turned so that the tips of the crowns lie in the plane XY on average, and what is seen from there."""
-    frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, tilt_sd_deg) @ start
-    return _relief(mesh, frame), frame
+    frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, tilt_sd_deg, off_plane_mm) @ start
+    return _relief(mesh, frame, off_plane_mm), frame
 
 
 def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:

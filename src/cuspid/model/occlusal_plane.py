@@ -19,7 +19,7 @@ _SQUARES_MM = (6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0)
 """Squares of which each has its own highest points, and so a plane: their mean depends less on single teeth."""
 _CROWN_MM = 3.0
 """A point belongs to the top of a crown if it lies less than this below the tip near it."""
-_SPEE_MM = 5.0
+SPEE_MM = 5.0
 """Tips lie within this below the plane on which the jaw would rest."""
 _TIP_SD_MM = 1.0
 """How far tips stand off their plane."""
@@ -28,31 +28,37 @@ _ROUNDS = 4
 
 
 def crown_tops(
-    heights: Float[np.ndarray, "h w"], spacing_mm: float, below_mm: float = _CROWN_MM
+    heights: Float[np.ndarray, "h w"], spacing_mm: float, below_mm: float = _CROWN_MM, off_plane_mm: float = SPEE_MM
 ) -> Bool[np.ndarray, "h w"]:
     """Where the tops of the crowns are, so far below a tip; heights that are not known are NaN."""
     summits = _summits(heights, spacing_mm, _TOOTH_MM)
-    return np.asarray((heights > summits - below_mm) & _on_plane(summits, heights))
+    return np.asarray((heights > summits - below_mm) & _on_plane(summits, heights, off_plane_mm))
 
 
 def crown_tips(
-    heights: Float[np.ndarray, "h w"], spacing_mm: float, square_mm: float = _TOOTH_MM
+    heights: Float[np.ndarray, "h w"], spacing_mm: float, square_mm: float = _TOOTH_MM, off_plane_mm: float = SPEE_MM
 ) -> Bool[np.ndarray, "h w"]:
     """Where the highest points of their surroundings are: tips of the cusps, and edges."""
     summits = _summits(heights, spacing_mm, square_mm)
-    return np.asarray((heights == summits) & _on_plane(summits, heights))
+    return np.asarray((heights == summits) & _on_plane(summits, heights, off_plane_mm))
 
 
-def levelled(seen: Callable[[Rigid3], Float[np.ndarray, "h w 3"]], spacing_mm: float, tilt_sd_deg: float) -> Rigid3:
+def levelled(
+    seen: Callable[[Rigid3], Float[np.ndarray, "h w 3"]],
+    spacing_mm: float,
+    tilt_sd_deg: float,
+    off_plane_mm: float = SPEE_MM,
+) -> Rigid3:
     """The turn about the origin that lays the tips of the crowns level: the mean over squares of several sizes.
 
     ``seen`` gives the surface as it is seen after a turn, on a grid of this spacing, NaN where it is not known. It is
-    about upright before: within ``tilt_sd_deg`` (standard deviation), which counts where tips are few or close.
+    about upright before: within ``tilt_sd_deg`` (standard deviation), which counts where tips are few or close. What
+    stands higher or lower than most by more than ``off_plane_mm`` is no tip.
     """
     turn = Rigid3.identity()
     for _ in range(_ROUNDS):
         points, back = seen(turn), turn.inverse()
-        tips = (points[crown_tips(points[..., 2], spacing_mm, square)] for square in _SQUARES_MM)
+        tips = (points[crown_tips(points[..., 2], spacing_mm, square, off_plane_mm)] for square in _SQUARES_MM)
         turn = upright(np.mean([_up_from_tips(back.apply(each), tilt_sd_deg) for each in tips], axis=0))
     return turn
 
@@ -82,7 +88,9 @@ def _summits(heights: Float[np.ndarray, "h w"], spacing_mm: float, square_mm: fl
     return np.asarray(maximum_filter(seen, max(1, round(square_mm / spacing_mm))))
 
 
-def _on_plane(summits: Float[np.ndarray, "h w"], heights: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _on_plane(
+    summits: Float[np.ndarray, "h w"], heights: Float[np.ndarray, "h w"], off_plane_mm: float
+) -> Bool[np.ndarray, "h w"]:
     """Whether summits are about as high as the tips are; flaps of gum may rise higher."""
     known = heights[np.isfinite(heights)]
-    return np.asarray(np.abs(summits - (np.percentile(known, 95) if len(known) else np.nan)) < _SPEE_MM)
+    return np.asarray(np.abs(summits - (np.percentile(known, 95) if len(known) else np.nan)) < off_plane_mm)
