@@ -52,10 +52,7 @@ def test_a_quadrant_with_its_base_lies_crowns_up_and_is_doubted(seed: int):
     assert any("which way is up" in note for note in found.notes)
 
 
-<<<<<<< HEAD
-=======
 @pytest.mark.long
->>>>>>> 5a97d5a3cfe088a56ff16aad3eac7b880024e5b4
 def test_a_wide_jaw_that_no_whole_arch_fits_is_doubted_and_keeps_its_frame(monkeypatch: pytest.MonkeyPatch):
     """Of a cast without its molars, say, only the front is doubtful."""
     mesh = horseshoe(120, 40).mesh.transformed(any_pose(1, 300))
