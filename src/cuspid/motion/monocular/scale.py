@@ -7,7 +7,7 @@ Frames: as in :mod:`cuspid.model.sparse_model`; ``board`` as in :mod:`cuspid.mod
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated
 
 import numpy as np
@@ -176,13 +176,27 @@ def scale_by_board(model: PhotoModel, sightings: Sequence[BoardSighting], board:
             f"{what} is seen in {len(sightings)} of {photographs} photographs, but {len(located)} of these could be "
             "located; it takes two, from different places"
         )
-    corner, points = _corners(model, _in_one_numbering(model, located, board))
+    numbered = _in_one_numbering(model, located, board)
+    corner, points = _corners(model, numbered)
     if len(corner) < _LEAST_CORNERS:
         raise ReconstructionError(
             f"{what}: only {len(corner)} of its corners are seen alike in two photographs; it moved, or is not this "
             "board"
         )
-    return _fit_board(board, board.corners[corner], points, what, len(located))
+    scale = _fit_board(board, board.corners[corner], points, what, len(located))
+    return replace(scale, sigma_share=max(scale.sigma_share, _jackknife(model, numbered, board)))
+
+
+def _jackknife(model: PhotoModel, sightings: Sequence[BoardSighting], board: Board) -> float:
+    """Standard deviation of the scale, as a share of it, by leaving out one photograph at a time: all corners of one
+    share the error of its pose, of which their scatter about the board tells little. 0 where too few are left."""
+    scales = []
+    for k in range(len(sightings)):
+        corner, points = _corners(model, [*sightings[:k], *sightings[k + 1 :]])
+        if len(corner) >= _LEAST_CORNERS:
+            scales.append(_fit_board(board, board.corners[corner], points, "", 0).mm_per_unit)
+    count = len(scales)
+    return float(np.sqrt((count - 1) / count) * np.std(scales) * np.sqrt(count) / np.mean(scales)) if count > 2 else 0.0
 
 
 def _corners(
@@ -256,7 +270,7 @@ def _fit_board(
     )
 
 
-def _board_notes(board: Board, left: Float[np.ndarray, "n 3"], used: Bool[np.ndarray, "n"]) -> tuple[str, ...]:
+def _board_notes(board: Board, left: Float[np.ndarray, "m 3"], used: Bool[np.ndarray, "n"]) -> tuple[str, ...]:
     notes = []
     within = float(np.sqrt(np.mean(left[:, :2] ** 2)))
     out = float(np.sqrt(np.mean(left[:, 2] ** 2)))
