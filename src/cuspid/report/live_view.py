@@ -14,6 +14,7 @@ import trimesh
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
+from cuspid.geometry import unit
 from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.model.rig import Handpiece
@@ -42,6 +43,8 @@ _MOST_MODES = 5
 _GAMMA = 2.2
 _NO_COLORS = "None"
 LOCAL = "127.0.0.1"
+_RAGGED_PCT = 2.0
+"""Of the faces of a mesh, on each side, that may lie outside of what is shown first."""
 _CAMERA_SHARE = 0.3
 """Of the working distance, the depth of the frustum by which a camera is shown."""
 _LIGHT_COLOR = (255, 200, 60)
@@ -84,7 +87,6 @@ def show_value(value: Viewable, port: int) -> Server:
     Raises MissingDependencyError without viser, TypeError for another value.
     """
     server = start(LOCAL, port)
-    server.scene.set_up_direction("+z")
     _light(server)
     _add_value(value, server)
     print(f"{address(LOCAL, server.get_port())} shows {value!r}")
@@ -99,7 +101,14 @@ def _add_value(value: object, server: Server) -> None:
 @_add_value.register
 def _(value: Mesh, server: Server) -> None:
     add(server, "/mesh", value, _plain(value, PLASTER_COLOR) if value.colors is None else value.colors, visible=True)
-    _look_down_on(server, value)
+    centres = value.face_centres
+    low, high = np.percentile(centres, [_RAGGED_PCT, 100 - _RAGGED_PCT], axis=0)
+    outwards = unit(np.sum(value.face_normals * value.face_areas[:, None], axis=0))
+    across = unit(np.cross(outwards, np.eye(3)[np.argmin(np.abs(outwards))]))
+    server.scene.set_up_direction(outwards)
+    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    server.initial_camera.look_at = tuple(map(float, middle))
+    server.initial_camera.position = tuple(map(float, middle + size * (outwards - 0.35 * across)))
 
 
 @_add_value.register
