@@ -35,7 +35,7 @@ def make_handpiece() -> Handpiece:
     camera = camera.with_parameters(camera.parameters + [0, 0, 2, -1, -0.08, 0.02, 1e-3, 0])
     places = {"a": [0.0, 0, 0], "b": [1.4, 0, 0], "c": [0.5, 1.2, 0]}
     cameras = {name: MountedCamera(camera, Rigid3(np.eye(3), -np.array(x))) for name, x in places.items()}
-    aside = Rigid3.from_rotation_vector(np.array([0, 0.9, 0]), np.array([0, 0, 5.0])) @ Rigid3(
+    aside = Rigid3.from_rotation_vector(np.array([0, 1.1, 0]), np.array([0, 0, 5.0])) @ Rigid3(
         np.eye(3), np.array([0, 0, -5.0])
     )
     return Handpiece(rig=Rig({**cameras, "side": MountedCamera(camera, aside)}))
