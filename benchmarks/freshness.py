@@ -12,7 +12,7 @@ import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -120,14 +120,14 @@ def _commits(result: Result) -> Iterator[str | None]:
 @cache
 def _changed_since(commit: str, maker: Maker) -> frozenset[str]:
     try:
-        before = _blobs("ls-tree", "-r", commit)
+        before = _contents(_blobs("ls-tree", "-r", commit))
     except subprocess.CalledProcessError:
         return frozenset({f"commit {commit} is not in this repository"})
     roots, now = _roots(maker), _code_of_today(maker.leaves_out)
     changed = {file for file in map(_file_of, now.modules(roots)) if file not in before or _differs(before[file], file)}
     if all(file in before for file in changed):
         return frozenset(changed)
-    then = _code(partial(_content_of, before), maker.leaves_out)
+    then = _code(before.get, maker.leaves_out)
     return frozenset() if _digests(then, roots) == _digests(now, roots) else frozenset(changed)  # some may have moved
 
 
@@ -137,14 +137,27 @@ def _blobs(*arguments: str) -> dict[str, str]:
     return {line.split("\t")[1]: line.split("\t")[0].split()[2] for line in lines}
 
 
-def _differs(blob: str, file: str) -> bool:
-    then, now = _content(blob), (ROOT / file).read_bytes()
+_read: dict[str, bytes] = {}
+"""Contents of files by Git's names for them; most commits share most of theirs."""
+
+
+def _contents(blobs: Mapping[str, str]) -> dict[str, bytes]:
+    """Python files and what is in them: what was not read before is read at once."""
+    files = {file: blob for file, blob in blobs.items() if file.endswith((".py", ".pyi"))}
+    wanted = sorted({blob for blob in files.values() if blob not in _read})
+    packed = memoryview(_git("cat-file", "--batch", given="\n".join(wanted).encode()) if wanted else b"")
+    while packed:
+        header, _, _ = bytes(packed[:100]).partition(b"\n")
+        blob, _, size = header.decode().split()
+        begin = len(header) + 1
+        _read[blob] = bytes(packed[begin : begin + int(size)])
+        packed = packed[begin + int(size) + 1 :]
+    return {file: _read[blob] for file, blob in files.items()}
+
+
+def _differs(then: bytes, file: str) -> bool:
+    now = (ROOT / file).read_bytes()
     return then != now and _meaning(then) != _meaning(now)
-
-
-@cache
-def _content(blob: str) -> bytes:
-    return _git("cat-file", "blob", blob)
 
 
 @cache
@@ -198,9 +211,5 @@ def _today(file: str) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def _content_of(blobs: Mapping[str, str], file: str) -> bytes | None:
-    return _content(blobs[file]) if file in blobs else None
-
-
-def _git(*arguments: str) -> bytes:
-    return subprocess.run(["git", "-C", str(ROOT), *arguments], check=True, capture_output=True).stdout
+def _git(*arguments: str, given: bytes = b"") -> bytes:
+    return subprocess.run(["git", "-C", str(ROOT), *arguments], check=True, capture_output=True, input=given).stdout
