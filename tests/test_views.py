@@ -20,6 +20,7 @@ from cuspid.fusion.depth_fusion import FusionOptions
 from cuspid.fusion.sharp_edges import SharpEdgeOptions
 from cuspid.fusion.stage import fuse
 from cuspid.geometry import Rigid3
+from cuspid.model.camera import Camera
 from cuspid.model.capture import Capture, Frame, ImageFolder, read_mask
 from cuspid.model.reconstruction import DepthMap, Funnel, Reconstruction, sum_funnels
 from cuspid.model.rig import Handpiece, MountedCamera, Rig
@@ -141,6 +142,32 @@ def test_weak_texture_gives_depth_that_is_less_certain() -> None:
         assert np.isfinite(error).mean() > 0.25
         assert 5 < np.nanmedian(error) < 75  # a pixel of disparity of the widest pair
         assert 0 < np.median(depth_map.confidence[depth_map.known]) < 0.7
+
+
+def across_mm(camera: Camera, cam_from_rig: Rigid3) -> np.ndarray:
+    """How far to the right in the rig each pixel of a camera sees the hills."""
+    depth = cast_depth(HILLS, camera, cam_from_rig)
+    return cam_from_rig.inverse().apply(camera.rays(camera.pixel_centres()) * depth[..., None])[..., 0]
+
+
+def test_what_is_weak_in_a_good_view_is_made_smooth_and_the_rest_stays_as_it_is() -> None:
+    rng, faint = np.random.default_rng(0), weak(1)
+    strong = {name: render(HILLS, each, Rigid3.identity(), rng) for name, each in diamond().rig.cameras.items()}
+    part = {
+        name: np.where(across_mm(each.camera, each.cam_from_rig)[..., None] > 0.8, faint[name], strong[name])
+        for name, each in diamond().rig.cameras.items()
+    }
+    for whole, found in zip(
+        *(DepthEstimator(diamond()).measure(each, "00000") for each in (strong, part)), strict=True
+    ):
+        place = across_mm(found.camera, found.cam_from_rig)
+        error_um = 1000 * np.abs(found.depth_mm - cast_depth(HILLS, found.camera, found.cam_from_rig))
+        good, poor = whole.known & (place < 0.4), whole.known & (place > 1.2)
+        assert found.known[good].mean() > 0.97
+        assert 0.5 < np.nanmedian(error_um[good]) < 5
+        assert found.known[poor].mean() > 0.25
+        assert 3 < np.nanmedian(error_um[poor]) < 75
+        assert np.nanmedian(found.sigma_mm[poor]) > 1.5 * np.nanmedian(found.sigma_mm[good])
 
 
 @given(st.floats(0.0, 85.0), st.integers(0, 9))

@@ -486,10 +486,14 @@ class Match:
         smooth &= weak
         depth = np.where(smooth, geometry.scale / q, one.depth_mm)
         step_mm = depth**2 / geometry.scale
-        least_mm = np.where(weak, _WEAK_SIGMA_PX * step_mm, 0)
-        sigma = np.where(smooth, sigma_q * step_mm, np.maximum(one.sigma_mm, least_mm))
-        depth = np.where(weak, even_out(depth, sigma, float(one.camera.focal_px.mean())), depth)
-        return replace(one, depth_mm=depth, sigma_mm=sigma, smooth=smooth & np.isfinite(depth))
+        sigma = np.where(smooth, sigma_q * step_mm, np.maximum(one.sigma_mm, _WEAK_SIGMA_PX * step_mm))
+        even = even_out(depth, sigma, float(one.camera.focal_px.mean()))
+        return replace(
+            one,
+            depth_mm=np.where(weak, even, depth),
+            sigma_mm=np.where(weak, sigma, one.sigma_mm),
+            smooth=smooth & np.isfinite(even),
+        )
 
 
 def measure_views(
