@@ -52,7 +52,7 @@ def poses(count: int, seed: int) -> Iterator[Rigid3]:
         yield Rigid3(Rotation.random(rng=rng).as_matrix(), rng.normal(0, 50, 3))
 
 
-def tried(mesh: Mesh, count: int, seed: int) -> Found:
+def find_frames(mesh: Mesh, count: int, seed: int) -> Found:
     """How a mesh in its occlusal frame comes out of so many poses."""
     outcomes: list[tuple[float, float, tuple[str, ...]]] = []
     for pose in poses(count, seed):
@@ -115,12 +115,12 @@ def main() -> None:
             continue
         if arguments.poses:
             as_it_is = {"labels_agree": labels_agree(jaw), "notes": [each.replace(str(path), name) for each in notes]}
-            jaws[name] = {**tried(jaw.mesh, arguments.poses, seed), **as_it_is}
+            jaws[name] = {**find_frames(jaw.mesh, arguments.poses, seed), **as_it_is}
             print(name, jaws[name], flush=True)
         if jaw.face_labels is not None and arguments.quadrant_poses:
             for side, mesh in quadrants_of(jaw):
                 at_the_end = not any(each in name for each in DEVELOPED_ON)
-                found = tried(mesh, arguments.quadrant_poses, 100 * seed + side)
+                found = find_frames(mesh, arguments.quadrant_poses, 100 * seed + side)
                 quadrants[f"{name} {side}"] = {**found, "looked_at_only_at_the_end": at_the_end}
                 print(name, side, quadrants[f"{name} {side}"], flush=True)
         told = {"within_deg": WITHIN_DEG, "jaws": jaws, "quadrants": quadrants, "refused": refused}

@@ -56,7 +56,7 @@ def truth(seed: int) -> PhotoModel:
     )
 
 
-def moved(model: PhotoModel, steps: np.ndarray) -> tuple[Camera, list[Rigid3]]:
+def step_by(model: PhotoModel, steps: np.ndarray) -> tuple[Camera, list[Rigid3]]:
     camera = model.cameras["camera"]
     values = camera.parameters.copy()
     values[:2] += 100 * steps[-2]
@@ -88,13 +88,13 @@ def adjust(model: PhotoModel, pixels: np.ndarray) -> tuple[Camera, list[Rigid3],
     begin = model.tracks.points
 
     def residuals(steps: np.ndarray) -> np.ndarray:
-        camera, poses = moved(model, steps)
+        camera, poses = step_by(model, steps)
         points = points_from(camera, poses, pixels, begin)
         off = [seen - camera.project(pose.apply(points)) for pose, seen in zip(poses, pixels, strict=True)]
         return np.concatenate([np.ravel(off), 1e-3 * steps])  # the whole may move: it is held, softly
 
     found = least_squares(residuals, np.zeros(6 * FRAMES + 2), max_nfev=6)
-    camera, poses = moved(model, found.x)
+    camera, poses = step_by(model, found.x)
     return camera, poses, points_from(camera, poses, pixels, begin)
 
 

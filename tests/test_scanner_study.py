@@ -25,7 +25,7 @@ from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
 from cuspid.studies.scanners.files import find_files, without_repeats
 from cuspid.studies.scanners.scan import StudyOptions
-from cuspid.studies.scanners.soundness import count_cuts, cut_notes, mended
+from cuspid.studies.scanners.soundness import count_cuts, cut_notes, mend_faces
 from cuspid.studies.scanners.specimen import guessed_unit, load_specimen
 from cuspid.studies.scanners.study import Intake, compare, foreseen, measure_share, prepare
 from cuspid.studies.scanners.summary import Group, difference_um, group_row, region_of
@@ -163,14 +163,14 @@ def test_the_unit_of_a_file_is_told_by_its_reference(tmp_path, jaw, per_mm, unit
 def test_faces_that_are_there_twice_are_used_once(jaw, turned):
     mesh = without_base(jaw.mesh)
     again = mesh.faces[:, ::-1] if turned else mesh.faces
-    one, notes = mended(Mesh(mesh.vertices, np.concatenate([mesh.faces, again])))
+    one, notes = mend_faces(Mesh(mesh.vertices, np.concatenate([mesh.faces, again])))
     assert notes == ("every face is there twice; one of each is used",)
     assert one.face_areas.sum() == pytest.approx(mesh.face_areas.sum())
     assert np.sum(one.face_centres * one.face_normals) == pytest.approx(np.sum(mesh.face_centres * mesh.face_normals))
-    some, notes = mended(Mesh(mesh.vertices, np.concatenate([mesh.faces, again[::3]])))
+    some, notes = mend_faces(Mesh(mesh.vertices, np.concatenate([mesh.faces, again[::3]])))
     assert len(some.faces) == len(mesh.faces)
     assert f"{len(again[::3])} of {len(mesh.faces) + len(again[::3])} faces" in notes[0]
-    assert mended(mesh) == (mesh, ())
+    assert mend_faces(mesh) == (mesh, ())
 
 
 @given(st.integers(1, 4), st.integers(0, 99))

@@ -211,24 +211,26 @@ def _calibrate_once(
     else:
         start, common = joined(views, board, cameras, sorted({instant for _, instant in views}))
 
-    def tried(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
+    def attempt(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
         found, chosen, notes = _fit_cameras(scene, common, board, options)
         return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes)))
 
-    best = _with_timing(tried(start), start, common, board, options, tried)
-    splined = _splined(best, choices, board) if options.lens == "auto" else {}
+    best = _with_timing(attempt(start), start, common, board, options, attempt)
+    splined = _find_splines(best, choices, board) if options.lens == "auto" else {}
     if splined:
         scene = best.found.scene
         cameras = {**scene.cameras, **{name: camera for name, (_, camera) in splined.items()}}
         poses = {**start.rig_from_board, **scene.rig_from_board}
         scene = replace(scene, cameras=cameras, rig_from_board=poses, loose_px=0.0, shape=None)
         with suppress(ReconstructionError):  # together with the other cameras
-            better = tried(scene, {**choices, **{name: choice for name, (choice, _) in splined.items()}})
+            better = attempt(scene, {**choices, **{name: choice for name, (choice, _) in splined.items()}})
             best = better if _keeps_most(better.described, best.described) else best
     return best.described
 
 
-def _splined(best: _Trial, choices: Mapping[str, LensChoice], board: Target) -> dict[str, tuple[LensChoice, Camera]]:
+def _find_splines(
+    best: _Trial, choices: Mapping[str, LensChoice], board: Target
+) -> dict[str, tuple[LensChoice, Camera]]:
     """Cameras whose views call for a splined lens, once it is known when each row was exposed."""
     views, found = at_middle_rows(best.found.scene, best.described.views, board), {}
     for name, camera in best.found.scene.cameras.items():
@@ -245,7 +247,7 @@ def _with_timing(
     common: Views,
     board: Target,
     options: CalibrationOptions,
-    tried: Callable[[BoardScene], _Trial],
+    attempt: Callable[[BoardScene], _Trial],
 ) -> _Trial:
     """With delays of the cameras and readouts, where these explain more."""
     frame = frame_numbers(start.rig_from_board)
@@ -258,13 +260,13 @@ def _with_timing(
     doubtful = any(_is_doubtful_together(check) for check in best.described.cameras.values())
     if len(start.cameras) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
         with suppress(ReconstructionError):  # the images do not tell delays as well
-            apart = tried(untied(start, frame, common))
+            apart = attempt(untied(start, frame, common))
             best = apart if _is_better(apart.described, best.described) else best
     if not may_roll(best.found.scene, best.described.views):
         return best
     scene = replace(best.found.scene, rig_from_board={**start.rig_from_board, **best.found.scene.rig_from_board})
     with suppress(ReconstructionError):  # nor readouts
-        rolled = tried(rolling(replace(scene, loose_px=0.0, shape=None), frame, common))
+        rolled = attempt(rolling(replace(scene, loose_px=0.0, shape=None), frame, common))
         best = rolled if _rolls(rolled, board) and _keeps_most(rolled.described, best.described) else best
     return best
 

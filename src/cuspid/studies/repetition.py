@@ -92,7 +92,7 @@ def list_scans(jaw: Jaw, outcomes: Sequence[Outcome], folder: Path) -> None:
         raise InputError(
             f"repeat: {len(names)} of {len(outcomes)} scans succeeded; at least two are needed ({reasons})"
         )
-    storage.write_jaw(folder / "reference.ply", _around(jaw, storage.read_mesh(folder / _mesh_file(names[0])).bounds))
+    storage.write_jaw(folder / "reference.ply", _crop_to(jaw, storage.read_mesh(folder / _mesh_file(names[0])).bounds))
     rows = [
         {
             "scanner": _SCANNER,
@@ -110,7 +110,7 @@ def _mesh_file(name: str) -> str:
     return f"meshes/{name}.ply"
 
 
-def _around(jaw: Jaw, bounds: np.ndarray) -> Jaw:
+def _crop_to(jaw: Jaw, bounds: np.ndarray) -> Jaw:
     """The faces of a jaw in a box with a margin."""
     centres = jaw.mesh.face_centres
     near = ((centres > bounds[0] - _MARGIN_MM) & (centres < bounds[1] + _MARGIN_MM)).all(axis=1)

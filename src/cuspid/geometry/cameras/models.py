@@ -76,13 +76,13 @@ def fold_radius(model: LensModel, distortion: Float[np.ndarray, "k"]) -> float:
     numerator, denominator = (np.array([1.0, *distortion[list(each)]]) for each in (model.numerator, model.denominator))
     odd, even = 1 + 2 * np.arange(len(numerator)), 2 * np.arange(len(denominator))
     slope = np.convolve(denominator, odd * numerator) - np.convolve(numerator, even * denominator)
-    roots = np.concatenate([np.roots(_shortened(each)[::-1]) for each in (slope, denominator)])
+    roots = np.concatenate([np.roots(_drop_negligible(each)[::-1]) for each in (slope, denominator)])
     real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
     first = float(np.sqrt(real.min())) if len(real) else np.inf
     return min(first, np.pi) if model.is_equidistant else first
 
 
-def _shortened(coefficients: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
+def _drop_negligible(coefficients: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
     """Without the highest ones where they are nothing."""
     some = np.flatnonzero(np.abs(coefficients) > _NOTHING)
     return coefficients[: some[-1] + 1]

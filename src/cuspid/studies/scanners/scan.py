@@ -28,7 +28,7 @@ from cuspid.runtime.options import SEED, SHARE, TOOTH, Options, Range
 from cuspid.storage import MM_PER_UNIT
 from cuspid.storage.files import write_arrays
 from cuspid.studies.scanners.files import ScanFile
-from cuspid.studies.scanners.soundness import cut_notes, mended
+from cuspid.studies.scanners.soundness import cut_notes, mend_faces
 from cuspid.studies.scanners.specimen import Specimen, guessed_unit, scan_landmarks
 
 Region = Literal["all", "crowns", "area"]
@@ -138,7 +138,7 @@ def write_measured(folder: Path, key: str, measured: Measured, *, made_from: str
 def _read(scan: ScanFile, specimen: Specimen) -> tuple[Mesh, dict[str, Any]]:
     read = storage.read_mesh(scan.path)
     unit, odd = guessed_unit(scan.path, read, like_mm=specimen.width_mm)
-    mesh, mending = mended(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
+    mesh, mending = mend_faces(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     # From here on in the frame that the reference was turned into: without an alignment both stay together.
     return mesh.transformed(specimen.occlusal_from_file), {
         "unit": unit,

@@ -23,7 +23,7 @@ _INSIDE = 0.01
 """The ends of an edge, as a share of its length, that touch its neighbours and are not looked at."""
 
 
-def mended(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
+def mend_faces(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
     """One of each face, looking outwards, and what was odd about them."""
     keep, doubled = first_of_each(mesh)
     outwards, turned = facing_outwards(mesh.submesh(keep) if doubled else mesh)

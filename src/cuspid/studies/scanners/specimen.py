@@ -34,7 +34,7 @@ from cuspid.runtime.workers import computed_once
 from cuspid.storage import MM_PER_UNIT, MeasuredFile, Unit
 from cuspid.storage.files import read_arrays, write_arrays
 from cuspid.studies.scanners.files import area_file, beside, body_file, landmark_file
-from cuspid.studies.scanners.soundness import cut_notes, first_of_each, mended
+from cuspid.studies.scanners.soundness import cut_notes, first_of_each, mend_faces
 
 PLACES = 60_000
 """Number of places on a reference."""
@@ -343,7 +343,7 @@ def _bodies_of(
         return None, {}, ()
     read = storage.read_mesh(library)
     unit, _ = guessed_unit(library, read, like_mm=8.0)
-    body, _ = mended(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
+    body, _ = mend_faces(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     surface = SignedDistance(body)
     found, notes = {}, []
     for row in storage.read_table(table, ("label", "x", "y", "z")):

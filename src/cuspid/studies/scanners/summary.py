@@ -27,7 +27,7 @@ from cuspid.runtime.progress import Progress, silent
 from cuspid.storage.files import read_arrays
 from cuspid.studies.scanners.files import Remark, ScanFile
 from cuspid.studies.scanners.scan import BEYOND, Measured, StudyOptions
-from cuspid.studies.scanners.soundness import mended
+from cuspid.studies.scanners.soundness import mend_faces
 from cuspid.studies.scanners.specimen import SEGMENTS, Specimen
 
 WITHIN_UM = (10, 25, 50, 100)
@@ -360,7 +360,7 @@ def _mesh_to_mesh(one: Compared, other: Compared, specimen: Specimen, options: S
 
 def _aligned_mesh(each: Compared, specimen: Specimen) -> Mesh:
     unit = each.measured.told["unit"]
-    mesh, _ = mended(storage.read_mesh(each.scan.path, unit))
+    mesh, _ = mend_faces(storage.read_mesh(each.scan.path, unit))
     pose = Rigid3.from_matrix(np.array(each.measured.told["reference_from_scan"])) @ specimen.occlusal_from_file
     return mesh.transformed(pose if each.motion is None else each.motion.rigid @ pose)
 
