@@ -52,6 +52,20 @@ def test_rays_invert_the_projection(model: str, data: st.DataObject) -> None:
     np.testing.assert_allclose(camera.rays(pixels[inside]), points[inside] / points[inside, 2:], rtol=0, atol=1e-9)
 
 
+def test_rays_are_found_where_the_image_is_about_to_fold() -> None:
+    camera = Camera(
+        width=64,
+        height=64,
+        focal_px=np.array([300.0, 300.0]),
+        principal_point_px=np.array([100.0, 100.0]),
+        distortion=np.array([0.140625, 0.03125, 0.0, -0.015625]),
+        model="OPENCV_FISHEYE",
+    )
+    angle = np.linspace(0.0, 0.9999 * camera.fold_radius, 200)
+    pixels = camera.project(np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1))
+    np.testing.assert_allclose(camera.project(camera.rays(pixels)), pixels, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("model", MODELS)
 @given(data=st.data())
 @settings(max_examples=10)

@@ -71,15 +71,35 @@ _NOTHING = 1e-12
 
 def fold_radius(model: LensModel, distortion: Float[np.ndarray, "k"]) -> float:
     """Ideal radius up to which the distorted one grows with it: from there on the model folds the image back onto
-    itself, and means nothing. Infinite for a perspective lens that never folds; at most pi for an equidistant one."""
+    itself, and means nothing. Infinite for a perspective lens that never folds; at most pi for an equidistant one.
+
+    The grid of a splined lens must change more slowly from place to place than its base: within the radius where it
+    does, the derivative of the whole is positive definite, so that no two places are shown at one."""
     # d(r N / D) / dr = (D (N + 2 r^2 N') - 2 r^2 N D') / D^2, with N and D by powers of r^2
     numerator, denominator = (np.array([1.0, *distortion[list(each)]]) for each in (model.numerator, model.denominator))
     odd, even = 1 + 2 * np.arange(len(numerator)), 2 * np.arange(len(denominator))
     slope = np.convolve(denominator, odd * numerator) - np.convolve(numerator, even * denominator)
-    roots = np.concatenate([np.roots(_drop_negligible(each)[::-1]) for each in (slope, denominator)])
+    spline = _steepest_shift(model, distortion)
+    slope[0] -= spline
+    sideways = np.array([numerator[0] - spline, *numerator[1:]])
+    if slope[0] <= 0:
+        return 0.0
+    limits = (slope, denominator, sideways) if model.splined else (slope, denominator)
+    roots = np.concatenate([np.roots(_drop_negligible(each)[::-1]) for each in limits])
     real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
     first = float(np.sqrt(real.min())) if len(real) else np.inf
     return min(first, np.pi) if model.is_equidistant else first
+
+
+def _steepest_shift(model: LensModel, distortion: Float[np.ndarray, "k"]) -> float:
+    """More than any derivative of the shift by the grid of a splined lens has as its spectral norm: the derivative of a
+    B-spline is a mean of the differences of neighbouring control points, which are 0 outside of the grid."""
+    if not model.splined:
+        return 0.0
+    reach, points = distortion[-2 * model.splined**2 - 1], distortion[-2 * model.splined**2 :]
+    grid = np.pad(points.reshape(2, model.splined, model.splined), ((0, 0), (1, 1), (1, 1)))
+    steps = [np.abs(np.diff(each, axis=axis)).max() for each in grid for axis in (0, 1)]
+    return float(np.linalg.norm(steps) * (model.splined - 3) / (2 * reach))
 
 
 def _drop_negligible(coefficients: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:

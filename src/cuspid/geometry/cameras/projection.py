@@ -16,6 +16,8 @@ _REACH, _CONTROL = 8, 9
 """Where the parameters of a splined lens have its reach and the first of its control points."""
 _STEPS, _SETTLED = 30, 1e-14
 """Of Newton's method for the inverse; and the step, in units of the ideal image, below which it ends."""
+_FARTHEST, _NEAR = 0.5, 0.1
+"""Length of a step at most, as a share of the distance from the axis, or in units of the ideal image."""
 _WRONG = 1e-9
 """Where what was found projects farther from the pixel than this, in the same units, there is no inverse."""
 _INSIDE = 0.99
@@ -270,7 +272,9 @@ def _invert_distortion(model, k, limit, a, b):
         step_u, step_v = (yv * (xd - a) - xv * (yd - b)) / determinant, (xu * (yd - b) - yu * (xd - a)) / determinant
         if not np.isfinite(step_u + step_v):
             break
-        u, v = u - step_u, v - step_v
+        # Beside the fold the slope is nearly 0, and a whole step leads far past the place.
+        share = min(1.0, max(_FARTHEST * np.hypot(u, v), _NEAR) / max(np.hypot(step_u, step_v), _NEAR))
+        u, v = u - share * step_u, v - share * step_v
         if abs(step_u) + abs(step_v) < _SETTLED:
             break
     xd, yd = distorted(model, k, u, v)
