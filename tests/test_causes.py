@@ -24,7 +24,7 @@ from cuspid.model.camera import Camera
 from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.rig import Rig
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.image_files import exif_orientation, read_image, recorded
+from cuspid.runtime.image_files import exif_orientation, read_image, undo_exif_orientation
 from verbs import refused, run
 
 BOARD = Board(columns=7, rows=6, square_mm=2.5)
@@ -172,7 +172,7 @@ def test_a_turned_image_is_turned_back_to_the_sensor(tmp_path: Path, orientation
     exif[0x0112] = orientation
     Image.fromarray(sensor).save(tmp_path / "x.png", exif=exif)
     assert exif_orientation(tmp_path / "x.png") == orientation
-    np.testing.assert_array_equal(recorded(read_image(tmp_path / "x.png"), orientation), sensor)
+    np.testing.assert_array_equal(undo_exif_orientation(read_image(tmp_path / "x.png"), orientation), sensor)
 
 
 @pytest.mark.parametrize("ways", [(1, 6), (3, 1), (8, 6), (6, 6)])

@@ -10,7 +10,7 @@ from hypothesis import given
 from scipy.spatial import KDTree
 
 from cuspid.geometry import Rigid3
-from cuspid.model.occlusal_plane import crown_tips, crown_tops, levelled, upright
+from cuspid.model.occlusal_plane import crown_tips, crown_tops, level_crowns, upright
 from cuspid.stitching.height_map import HeightMap
 from cuspid.stitching.levelling import level_by_crowns, turned
 from strategies import vectors
@@ -70,7 +70,7 @@ def test_a_tilted_surface_is_levelled(world_from_new: Rigid3):
     # What is known before holds back less than an eighth.
     assert angle_degrees(level.rotation[2], world_from_new.rotation[2]) < 0.1 + world_from_new.angle_deg / 8
     assert np.all(level.translation == 0)
-    unprejudiced = levelled(lambda turn: known_places(turned(surface, turn)), CELL_MM, 90.0)
+    unprejudiced = level_crowns(lambda turn: known_places(turned(surface, turn)), CELL_MM, 90.0)
     assert angle_degrees(unprejudiced.rotation[2], world_from_new.rotation[2]) < 0.15
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from cuspid import storage
 from cuspid.handpiece.designs import DesignOptions, essential_four, twelve_cameras
-from cuspid.model.tolerances import EXACT, NominalOptions, held, is_nominal
+from cuspid.model.tolerances import EXACT, NominalOptions, is_nominal, without_covariances
 from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.simulation.stage import SimulationOptions, simulate
@@ -39,17 +39,17 @@ def test_what_is_not_manufactured_anew_stays_as_well_known_as_it_was():
 
 def test_only_what_nobody_has_said_is_assumed():
     drawn = essential_four(DesignOptions())
-    assumed = NominalOptions(place_um=40.0).of(drawn).fill(drawn)
+    assumed = NominalOptions(place_um=40.0).for_handpiece(drawn).fill(drawn)
     assert is_nominal(drawn)
     assert not is_nominal(assumed)
     for given in (EXACT.fill(drawn), ROUGH.tolerances.fill(drawn)):
         assert not is_nominal(given)
-        for name, mounted in NominalOptions().of(given).fill(given).rig.cameras.items():
+        for name, mounted in NominalOptions().for_handpiece(given).fill(given).rig.cameras.items():
             assert mounted is given.rig[name]
     for name, mounted in assumed.rig.cameras.items():
         assert np.allclose(np.sqrt(np.diag(mounted.covariance)), [*[np.deg2rad(0.2)] * 3, *[0.04] * 3])
         assert np.array_equal(mounted.cam_from_rig.matrix, drawn.rig[name].cam_from_rig.matrix)
-    assert is_nominal(held(assumed))
+    assert is_nominal(without_covariances(assumed))
 
 
 @pytest.mark.parametrize("factor", [0.1, 100.0])
@@ -61,7 +61,9 @@ def test_a_handpiece_of_another_size_is_as_well_known_for_its_size(factor):
         working_distance_mm=factor * drawn.working_distance_mm,
         depth_range_mm=(factor * near, factor * far),
     )
-    assert NominalOptions().of(larger).place_mm == pytest.approx(factor * NominalOptions().of(drawn).place_mm)
+    assert NominalOptions().for_handpiece(larger).place_mm == pytest.approx(
+        factor * NominalOptions().for_handpiece(drawn).place_mm
+    )
 
 
 def test_what_is_built_is_off_by_what_the_tolerances_say():

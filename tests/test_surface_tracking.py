@@ -14,7 +14,7 @@ from cuspid.model.capture import Capture, Frame
 from cuspid.model.mesh import Mesh
 from cuspid.model.reconstruction import DepthMap, Reconstruction
 from cuspid.model.rig import Handpiece, Light
-from cuspid.model.tolerances import NominalOptions, held
+from cuspid.model.tolerances import NominalOptions, without_covariances
 from cuspid.motion.bundle.expectation import expectation_of
 from cuspid.motion.bundle.held_calibration import depth_sigma_mm
 from cuspid.motion.icp.surface_tracking import SurfaceTrackingOptions, _drift, _register_icp, adjusted, track_surfaces
@@ -225,11 +225,11 @@ def test_exact_surfaces_give_an_exact_path() -> None:
 @pytest.mark.long
 def test_what_an_uncertain_calibration_does_is_told() -> None:
     """Exact: nothing. 0.2 degrees and 30 um of each camera: tenths of a millimetre."""
-    maps, drawn = depth_maps(OUT), held(diamond(SIZE_PX))
+    maps, drawn = depth_maps(OUT), without_covariances(diamond(SIZE_PX))
     exact = track_surfaces(capture_of(drawn, tuple(OUT)), maps)
     assert "taken as exact" in exact.notes[0]
     assert exact.told_by == "poses alone"
-    nominal = NominalOptions().of(drawn).fill(drawn)
+    nominal = NominalOptions().for_handpiece(drawn).fill(drawn)
     told = track_surfaces(capture_of(nominal, tuple(OUT)), maps).notes[0]
     assert f"{depth_sigma_mm(nominal):.2g} mm" in told
     assert 0.03 < depth_sigma_mm(nominal) < 0.3

@@ -8,7 +8,7 @@ from string import Formatter
 from typing import Any
 
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 Result = Mapping[str, Any]
 Results = Mapping[str, Result]
@@ -41,7 +41,7 @@ def looking(where: str) -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError) as error:
-        raise InputError(f"results {where}: unexpected content ({shown(error)}); run it again") from error
+        raise InputError(f"results {where}: unexpected content ({quote(error)}); run it again") from error
 
 
 class _Paths(Formatter):

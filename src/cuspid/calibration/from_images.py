@@ -22,7 +22,7 @@ from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.rig import Handpiece, depth_of_field_mm
 from cuspid.runtime.errors import ReconstructionError
 from cuspid.runtime.progress import Progress, silent
-from cuspid.runtime.values import named
+from cuspid.runtime.values import join_names
 from cuspid.runtime.workers import map_in_threads
 
 _OTHER_CIRCLES = 0.06
@@ -166,7 +166,8 @@ def _unseen(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[st
     for name, sequence in sequences.items():
         unseen = [instant for instant in sequence.names if (name, instant) not in views]
         if unseen:
-            yield f"camera {name}: the board was not found in {len(unseen)} of {len(sequence)} images: {named(unseen)}"
+            missed = f"{len(unseen)} of {len(sequence)} images: {join_names(unseen)}"
+            yield f"camera {name}: the board was not found in {missed}"
 
 
 def _handpiece(

@@ -326,7 +326,7 @@ def _print_spheres(report: SphereReport) -> None:
 
 
 def _print_nominal(handpiece: Handpiece, options: NominalOptions) -> None:
-    assumed = options.of(handpiece)
+    assumed = options.for_handpiece(handpiece)
     console.print(
         "calibration: the handpiece file gives no uncertainties; it is taken as nominal, accurate (one sigma) to "
         f"{1000 * assumed.place_mm:.3g} µm and {assumed.turn_deg:g}° in the pose of each camera, "

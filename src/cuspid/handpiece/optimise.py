@@ -37,7 +37,7 @@ from cuspid.model.visibility import VisibilityOptions, visible_faces
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import SEED, Options, Range
 from cuspid.runtime.progress import Progress, silent
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 _REACH_MM = 11.0
 """Of the mesh around the middle of a tooth, so much is kept on all sides."""
@@ -239,7 +239,7 @@ def _check_surfaces(brief: DesignBrief, sections: Sequence[Section]) -> None:
     for name in brief.surfaces:
         if name not in there:
             raise InputError(
-                f"brief: the surface {shown(name)} must be seen, but the teeth given have only "
+                f"brief: the surface {quote(name)} must be seen, but the teeth given have only "
                 f"{', '.join(sorted(there)) or 'none'}"
             )
 

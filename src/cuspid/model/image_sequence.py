@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from cuspid.model.camera import Camera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.image_files import read_image, recorded
+from cuspid.runtime.image_files import read_image, undo_exif_orientation
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,7 +52,7 @@ class ImageSequence:
         """RGB image of a frame. Raises InputError where the file is missing, damaged, or of another size."""
         image = read_image(self.paths[index])
         if self.orientations:
-            image = np.ascontiguousarray(recorded(image, self.orientations[index]))
+            image = np.ascontiguousarray(undo_exif_orientation(image, self.orientations[index]))
         if image.shape[1::-1] != self.size:
             raise InputError(f"{self.paths[index]}: its size changed while it was in use; start again")
         return image

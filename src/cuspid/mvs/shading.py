@@ -154,7 +154,7 @@ class _Fit(NamedTuple):
 
 def correction(camera: Camera, sensor: Sensor) -> Float32[np.ndarray, "h w 1"]:
     """What turns the digital numbers of a camera into those of one of gain 1 without falloff, pixel by pixel."""
-    return sensor.transmitted(camera, camera.pixel_centres())[..., None].astype(np.float32) ** (-1 / sensor.gamma)
+    return sensor.relative_response(camera, camera.pixel_centres())[..., None].astype(np.float32) ** (-1 / sensor.gamma)
 
 
 def brightness(

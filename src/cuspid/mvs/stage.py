@@ -14,7 +14,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.capture import Capture, Frame
 from cuspid.model.pairing import camera_groups
 from cuspid.model.reconstruction import DepthMap, Reconstruction, SurfacePoints
-from cuspid.model.tolerances import held
+from cuspid.model.tolerances import without_covariances
 from cuspid.mvs.across import (
     AcrossOptions,
     measure_moving_cameras,
@@ -298,7 +298,7 @@ def _measure_all(
     stage: Stage,
     progress: Progress,
 ) -> StoredDepthMaps:
-    handpiece = hash_handpiece(held(capture.handpiece))  # how well it is known makes no depth
+    handpiece = hash_handpiece(without_covariances(capture.handpiece))  # how well it is known makes no depth
     files = [stage.folder / f"{frame.name}.npz" for frame in frames]
 
     def keep(one: tuple[Frame, Path]) -> str:

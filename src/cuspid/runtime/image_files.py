@@ -170,7 +170,7 @@ def recorded_size(path: Path) -> tuple[int, int]:
     return (height, width) if exif_orientation(path) in LYING else (width, height)
 
 
-def recorded(upright: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
+def undo_exif_orientation(upright: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """An image that was turned upright by its EXIF orientation, as the sensor recorded it."""
     # Each way is its own reverse, but for the two quarter turns, which are each other's.
     return _undo_exif_rotation(upright, {6: 8, 8: 6}.get(orientation, orientation))

@@ -34,7 +34,7 @@ from cuspid.model.shutter import Shutter, screw_of
 from cuspid.runtime import workers
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.kernels import kernel
-from cuspid.runtime.workers import computed_once, packed
+from cuspid.runtime.workers import computed_once, pickle_fields
 from cuspid.simulation.appearance import (
     NO_MATERIAL,
     Appearance,
@@ -599,7 +599,7 @@ def render_capture(
     if processes == 1:
         yield from map(worker, tasks)
         return
-    given = worker if workers.START_METHOD == "fork" else packed(worker)
+    given = worker if workers.START_METHOD == "fork" else pickle_fields(worker)
     with ProcessPoolExecutor(processes, get_context(workers.START_METHOD), _adopt, (given,)) as pool:
         for done in as_completed([pool.submit(_work, task) for task in tasks]):
             yield done.result()

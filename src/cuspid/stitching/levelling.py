@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.geometry import Rigid3
-from cuspid.model.occlusal_plane import levelled
+from cuspid.model.occlusal_plane import level_crowns
 from cuspid.stitching.height_map import AXES_SD_DEG, HeightMap
 
 _STEPS = 8
@@ -24,7 +24,7 @@ def level_by_crowns(surface: HeightMap) -> Rigid3:
         there = turned(surface, turn)
         return np.where(there.known[..., None], there.places, np.nan)
 
-    return levelled(seen, surface.cell_mm, AXES_SD_DEG)
+    return level_crowns(seen, surface.cell_mm, AXES_SD_DEG)
 
 
 def turned(surface: HeightMap, new_from_world: Rigid3) -> HeightMap:

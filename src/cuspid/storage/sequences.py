@@ -17,7 +17,7 @@ from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.values import checked_name
 from cuspid.storage.calibrations import MOST_LOST_PX, read_calibration
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
-from cuspid.storage.files import digest_of, finished, hash_file, read_json
+from cuspid.storage.files import digest_of, hash_file, list_finished, read_json
 from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.videos import VIDEO_SUFFIXES, read_video, video_length
 
@@ -74,7 +74,7 @@ def rig_sources(folder: Path) -> dict[str, Path]:
     home = folder / "images" if (folder / "images").is_dir() else folder
     if not home.is_dir():
         raise InputError(f"{folder}: no such folder")
-    sources = sorted(path for path in finished(home) if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES)
+    sources = sorted(path for path in list_finished(home) if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES)
     if not sources:
         raise InputError(f"{home}: it contains no folder of images and no video; each camera needs one")
     named = {checked_name(f"{home}: cameras", path.name if path.is_dir() else path.stem): path for path in sources}
@@ -92,7 +92,7 @@ def hash_source(source: Path) -> str:
 
 def images_in(folder: Path) -> list[Path]:
     """The images of a folder, in the order of the numbers in their names."""
-    images = [path for path in finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in list_finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
     return sorted(images, key=lambda path: name_order(path.name))
 
 

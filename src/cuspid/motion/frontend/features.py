@@ -156,10 +156,10 @@ def _load(path: Path) -> Features:
 
 def _where_shown(mask: UInt8[np.ndarray, "h w"] | None, lens: Camera) -> UInt8[np.ndarray, "h w"] | None:
     """The mask without what the model of the lens has no direction for."""
-    if lens.shown is None:
+    if lens.valid_mask is None:
         return mask
-    whole = np.full(lens.shown.shape, 255, dtype=np.uint8) if mask is None else mask
-    return np.where(lens.shown, whole, np.uint8(0))
+    whole = np.full(lens.valid_mask.shape, 255, dtype=np.uint8) if mask is None else mask
+    return np.where(lens.valid_mask, whole, np.uint8(0))
 
 
 def _detect_kept(
@@ -172,7 +172,7 @@ def _detect_kept(
         return detect(pictures.image(frame, camera), options, mask)
     path = stage.folder / camera / f"{frame.name}.npz"
     made_from = {"image": pictures.capture.source.digest(frame.name, camera)}
-    if lens.shown is not None:
+    if lens.valid_mask is not None:
         made_from["lens"] = digest_of([lens.model, lens.parameters])
     key = stage.key(made_from)
     if stage.has(key, [path]):

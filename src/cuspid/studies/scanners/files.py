@@ -19,7 +19,7 @@ from cuspid import storage
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import is_there
 from cuspid.storage import MARKUPS_SUFFIX, MESH_SUFFIXES
-from cuspid.storage.files import finished
+from cuspid.storage.files import list_finished
 
 REFERENCE = "reference"
 """Name of the folder of references."""
@@ -159,7 +159,7 @@ def belongings(reference: Path) -> tuple[Path, ...]:
 def _from_folder(folder: Path) -> StudyFiles:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give FOLDER/<scanner>/<specimen>/<scan>.stl, or a CSV manifest")
-    home = next((path for path in finished(folder) if path.is_dir() and path.name.lower() == REFERENCE), None)
+    home = next((path for path in list_finished(folder) if path.is_dir() and path.name.lower() == REFERENCE), None)
     if home is None:
         raise InputError(f"{folder}: has no folder '{REFERENCE}' with a mesh of each specimen, <specimen>.stl")
     references = {path.stem: path for path in _meshes(home) if not _goes_along(path)}
@@ -167,7 +167,7 @@ def _from_folder(folder: Path) -> StudyFiles:
         raise InputError(f"{home}: holds no mesh; give one of each specimen (STL, PLY, OBJ, OFF)")
     scans: list[ScanFile] = []
     remarks: list[Remark] = []
-    for scanner in sorted(path for path in finished(folder) if path.is_dir() and path != home):
+    for scanner in sorted(path for path in list_finished(folder) if path.is_dir() and path != home):
         for specimen, path in _of_scanner(scanner, references, remarks):
             scans.append(ScanFile(scanner=scanner.name, specimen=specimen, scan=path.stem, path=path))
     return StudyFiles(scans=_told_apart(scans), references=references, remarks=tuple(remarks))
@@ -181,7 +181,7 @@ def _of_scanner(scanner: Path, references: Mapping[str, Path], remarks: list[Rem
     elif direct:
         why = f"{len(direct)} meshes lie in no folder of a specimen ({', '.join(references)}); left out"
         remarks.append(Remark(what=scanner.name, why=why, left_out=True))
-    for folder in sorted(path for path in finished(scanner) if path.is_dir()):
+    for folder in sorted(path for path in list_finished(scanner) if path.is_dir()):
         meshes = _meshes(folder)
         if folder.name in references:
             yield from ((folder.name, path) for path in meshes)
@@ -192,7 +192,7 @@ def _of_scanner(scanner: Path, references: Mapping[str, Path], remarks: list[Rem
 
 
 def _meshes(folder: Path) -> list[Path]:
-    return sorted(path for path in finished(folder) if path.is_file() and path.suffix.lower() in MESH_SUFFIXES)
+    return sorted(path for path in list_finished(folder) if path.is_file() and path.suffix.lower() in MESH_SUFFIXES)
 
 
 def _goes_along(path: Path) -> bool:
