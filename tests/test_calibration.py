@@ -13,8 +13,8 @@ from cuspid.calibration.board_shape import BoardShape
 from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
-from cuspid.calibration.start import board_pose, first_camera, renumbered
-from cuspid.calibration.timing import adjust_scene, rolling, untied
+from cuspid.calibration.start import board_pose, first_camera, renumber_instant
+from cuspid.calibration.timing import adjust_scene, allow_delays, rolling
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
 from cuspid.model.camera import Camera
@@ -123,12 +123,12 @@ def test_jacobian_agrees_with_finite_differences(exposure):
     views = views_of(truth, BOARD, 1.0, np.random.default_rng(0))
     if exposure != "together":
         frame, rng = frame_numbers(truth.rig_from_board), np.random.default_rng(1)
-        truth = untied(truth, frame, views)
+        truth = allow_delays(truth, frame, views)
         truth = rolling(truth, frame, views) if exposure == "rolling" else truth
         later = [rng.normal(0, 0.2, count) for count in (3, len(truth.timing.readout), len(views))]
         truth = replace(truth, timing=truth.timing.later(*later))
     even = BoardShape.even(BOARD)
-    truth = replace(truth, shape=even.moved(np.random.default_rng(2).normal(0, 0.05, even.offsets_mm.size)))
+    truth = replace(truth, shape=even.with_step(np.random.default_rng(2).normal(0, 0.05, even.offsets_mm.size)))
     seen = bundle._Observations.of(views, BOARD, truth)
     free = bundle._Free.of(truth, seen, BOARD, only_boards=False)
     values = bundle._derivatives(truth, seen, bundle._project(truth, seen).in_cam)
@@ -226,12 +226,12 @@ def test_an_instant_that_is_numbered_otherwise_is_found_before_an_uneven_board(f
     about = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.array([*CHESS.size_mm, 0.0]))
     poses = {**uneven.rig_from_board, "05": uneven.rig_from_board["05"] @ about}
     start = replace(uneven, rig_from_board=poses)
-    start = untied(start, frame_numbers(poses), turned) if filmed else start
-    found = renumbered(adjust_scene(start, turned, CHESS, only_boards=True), turned, CHESS)
+    start = allow_delays(start, frame_numbers(poses), turned) if filmed else start
+    found = renumber_instant(adjust_scene(start, turned, CHESS, only_boards=True), turned, CHESS)
     assert found is not None
     assert all(np.array_equal(view.corner, views[key].corner) for key, view in found[1].items())
     assert np.allclose(found[0].rig_from_board["05"].matrix, uneven.rig_from_board["05"].matrix, atol=0.01)
-    assert renumbered(adjust_scene(uneven, views, CHESS, only_boards=True), views, CHESS) is None
+    assert renumber_instant(adjust_scene(uneven, views, CHESS, only_boards=True), views, CHESS) is None
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from cuspid.calibration import corners
 from cuspid.calibration.calibrate import size_notes
 from cuspid.calibration.causes import cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import find_corners
-from cuspid.calibration.from_images import _matched
+from cuspid.calibration.from_images import _match_frames
 from cuspid.calibration.instants import common_instants
 from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.camera import Camera
@@ -136,7 +136,7 @@ def test_prefixed_images_are_matched_and_it_is_told() -> None:
         )
         for camera in ("left", "right")
     }
-    matched, (note,) = _matched(sequences)
+    matched, (note,) = _match_frames(sequences)
     assert [each.names for each in matched.values()] == [("1", "2"), ("1", "2")]
     assert "left: left_0001 is 1, right: right_0001 is 1" in note
 

@@ -28,7 +28,7 @@ from cuspid import storage
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GroupName, draw_population
-from cuspid.anatomy.shape.boxed import boxed
+from cuspid.anatomy.shape.boxed import box_crowns
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.report.figures.drawing import save_picture
 from cuspid.runtime.errors import CuspidError, InputError
@@ -123,7 +123,7 @@ def _mean_shape(task: Task) -> Iterator[tuple[str, Result]]:
     (task.folder / "images").mkdir(parents=True, exist_ok=True)
     save_picture(task.folder / "images" / "shape-mean.png", mean.mesh, title=f"Mean of {count} phantoms")
     title = f"Mean of {count} phantoms, with a box for each tooth"
-    save_picture(task.folder / "images" / "shape-boxed.png", boxed(mean).mesh, title=title)
+    save_picture(task.folder / "images" / "shape-boxed.png", box_crowns(mean).mesh, title=title)
     yield "mean_shape", result
 
 

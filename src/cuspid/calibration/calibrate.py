@@ -31,8 +31,8 @@ from cuspid.calibration.circle_centres import centre_shifts
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, split_by_board
 from cuspid.calibration.joining import joined_boards
 from cuspid.calibration.lenses import LensChoice, LensName, choose_lens, splined_where_earned
-from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, renumbered, require_one_group
-from cuspid.calibration.timing import adjust_scene, follow_each_other, rolling, untied
+from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, join_cameras, renumber_instant, require_one_group
+from cuspid.calibration.timing import adjust_scene, allow_delays, follow_each_other, rolling
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.camera import Camera
@@ -185,7 +185,7 @@ def _correct_circle_centres(views: Views, found: RigCalibration, board: Board) -
             cam_from_board = board_pose(view, board, camera)
         except InputError:  # it is left out in any case
             continue
-        centred[name, instant] = view.moved(-centre_shifts(camera, cam_from_board, board, view.corner))
+        centred[name, instant] = view.shifted(-centre_shifts(camera, cam_from_board, board, view.corner))
     return centred
 
 
@@ -209,7 +209,7 @@ def _calibrate_once(
     if isinstance(board, BoardSet):
         start, common, how = joined_boards(views, board, cameras)
     else:
-        start, common = joined(views, board, cameras, sorted({instant for _, instant in views}))
+        start, common = join_cameras(views, board, cameras, sorted({instant for _, instant in views}))
 
     def attempt(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
         found, chosen, notes = _fit_cameras(scene, common, board, options)
@@ -260,7 +260,7 @@ def _with_timing(
     doubtful = any(_is_doubtful_together(check) for check in best.described.cameras.values())
     if len(start.cameras) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
         with suppress(ReconstructionError):  # the images do not tell delays as well
-            apart = attempt(untied(start, frame, common))
+            apart = attempt(allow_delays(start, frame, common))
             best = apart if _is_better(apart.described, best.described) else best
     if not may_roll(best.found.scene, best.described.views):
         return best
@@ -362,7 +362,7 @@ def _uneven(found: Adjusted, views: Views, board: Board) -> tuple[Adjusted, View
         replace(found.scene, shape=BoardShape.even(board)), {key: views[key] for key in found.residuals}, board
     )
     for _ in range(_TURNS if len(board.orders) > 1 else 0):
-        turned = renumbered(found, {key: views[key] for key in found.residuals}, board)
+        turned = renumber_instant(found, {key: views[key] for key in found.residuals}, board)
         if turned is None:
             break
         scene, used = turned
@@ -596,17 +596,19 @@ def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjus
 def _lens_apart(camera: Camera, alone: Adjusted) -> float:
     """Difference of the parameters from those of the camera alone, in the standard deviations of these."""
     (other,) = (each.camera for each in mounted_cameras(alone).values())
-    return _in_sigmas(camera.parameters - other.parameters, known(other.covariance))
+    return _in_sigmas(camera.parameters - other.parameters, require_covariance(other.covariance))
 
 
 def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
     """With covariances that account for how far two halves of the images are apart, and the lens from that of its own
     views alone, where chance hardly explains it; and with its shutter."""
-    camera = replace(mounted.camera, covariance=_lens_factor(check) ** 2 * known(mounted.camera.covariance))
+    camera = replace(
+        mounted.camera, covariance=_lens_factor(check) ** 2 * require_covariance(mounted.camera.covariance)
+    )
     return replace(
         mounted,
         camera=camera,
-        covariance=_beyond_chance(check.place_apart) ** 2 * known(mounted.covariance),
+        covariance=_beyond_chance(check.place_apart) ** 2 * require_covariance(mounted.covariance),
         shutter=Shutter(
             delay_frames=check.delay_frames or 0.0,
             delay_sigma_frames=check.delay_spread_frames or 0.0,
@@ -680,7 +682,7 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
                 "they may not have seen the board at the same moment, or have moved against each other"
             )
     for name, mounted in rig.cameras.items():
-        share = float(np.sqrt(known(mounted.camera.covariance)[0, 0])) / mounted.camera.focal_px[0]
+        share = float(np.sqrt(require_covariance(mounted.camera.covariance)[0, 0])) / mounted.camera.focal_px[0]
         if share > _OPEN_SHARE:
             yield f"camera {name}: its focal length is known only to {share:.0%}; show the board tilted, near and far"
 
@@ -737,13 +739,13 @@ def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
         a, b = ours[name], theirs[name]
         shift = a.camera.parameters - b.camera.parameters
         found[name] = (
-            _in_sigmas(shift, known(a.camera.covariance) + known(b.camera.covariance)),
-            _in_sigmas(motion, known(a.covariance) + known(b.covariance)),
+            _in_sigmas(shift, require_covariance(a.camera.covariance) + require_covariance(b.camera.covariance)),
+            _in_sigmas(motion, require_covariance(a.covariance) + require_covariance(b.covariance)),
         )
     return found
 
 
-def known(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"]:
+def require_covariance(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"]:
     """The covariance of a camera that was calibrated here, which always has one."""
     if covariance is None:
         raise ValueError("a calibration without covariance")

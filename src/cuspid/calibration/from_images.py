@@ -59,7 +59,7 @@ def calibrate(
     distance of the board. Raises ReconstructionError, which names the cause, where a camera hardly saw the board as it
     was described, and InputError where nothing tells which images were taken together.
     """
-    images, named_notes = _matched(images)
+    images, named_notes = _match_frames(images)
     views = _views(images, board, progress)
     _require_views(images, views, board)
     found = calibrate_rig(views, {name: each.size for name, each in images.items()}, board, options)
@@ -92,7 +92,7 @@ def _light(
     return calibrate_light(found, patches, board, drawn, options)
 
 
-def _matched(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSequence], tuple[str, ...]]:
+def _match_frames(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSequence], tuple[str, ...]]:
     """With frames that have one name where they were taken at one instant, and how they were matched if not by theirs.
     Raises InputError where nothing tells."""
     instants = common_instants({camera: each.names for camera, each in sequences.items()})
@@ -178,10 +178,12 @@ def _handpiece(
     if drawn is not None:
         lights = drawn.lights if light is None else light.lights
         known = replace(drawn, rig=found.rig, lights=lights, sensors={**drawn.sensors, **sensors}, name="calibrated")
-        return known if working_distance_mm is None else _focused(known, working_distance_mm)
+        return known if working_distance_mm is None else _focus_at(known, working_distance_mm)
     distance_mm = found.distance_mm if working_distance_mm is None else working_distance_mm
-    return _focused(Handpiece(rig=found.rig.over_surface(distance_mm), sensors=sensors, name="calibrated"), distance_mm)
+    return _focus_at(
+        Handpiece(rig=found.rig.over_surface(distance_mm), sensors=sensors, name="calibrated"), distance_mm
+    )
 
 
-def _focused(handpiece: Handpiece, distance_mm: float) -> Handpiece:
+def _focus_at(handpiece: Handpiece, distance_mm: float) -> Handpiece:
     return replace(handpiece, working_distance_mm=distance_mm, depth_range_mm=depth_of_field_mm(distance_mm))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from cuspid.calibration.bundle import bent
+from cuspid.calibration.bundle import bend_points
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
 from cuspid.model.camera import Camera
@@ -162,7 +162,7 @@ def on_board(
     board: Board, places: Float[np.ndarray, "n 2"], bending_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Places seen from straight above, in the frame of the board, mm."""
-    return bent(board, np.column_stack([places, -board.step_mm * board.terrace_at(places[:, 0])]), bending_mm)
+    return bend_points(board, np.column_stack([places, -board.step_mm * board.terrace_at(places[:, 0])]), bending_mm)
 
 
 def _in_squares(board: Board, corner: Int[np.ndarray, "k"], places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:

@@ -83,7 +83,7 @@ class Section:
     """Positions of the handpiece."""
 
     @staticmethod
-    def near(
+    def cut(
         mesh: Mesh,
         tooth: Bool[np.ndarray, "f"],
         surfaces: Mapping[str, Bool[np.ndarray, "f"]],
@@ -111,7 +111,7 @@ class Condition:
     """Whether the limit is a lower one."""
 
     @property
-    def met(self) -> bool:
+    def is_met(self) -> bool:
         """Up to rounding."""
         return self.shortfall <= 1e-6
 
@@ -147,7 +147,7 @@ class Assessment:
     @property
     def unmet(self) -> tuple[Condition, ...]:
         """The conditions that are missed."""
-        return tuple(condition for condition in self.conditions if not condition.met)
+        return tuple(condition for condition in self.conditions if not condition.is_met)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

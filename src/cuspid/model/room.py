@@ -71,7 +71,7 @@ class _Balls:
     radii: Float[np.ndarray, "b"]
 
     @staticmethod
-    def around(points: Float[np.ndarray, "n 3"]) -> _Balls:
+    def build(points: Float[np.ndarray, "n 3"]) -> _Balls:
         """Halved across the longest side of the box around them, again and again."""
         levels = max(0, int(np.log2(len(points) / _LEAF)))
         leaf = -(-len(points) // 2**levels)
@@ -199,7 +199,7 @@ class Room:
 # A search for a handpiece asks many bodies about few meshes.
 @lru_cache(maxsize=8)
 def _balls_of(mesh: Mesh) -> _Balls:
-    return _Balls.around(surface_points(mesh, _APART_MM))
+    return _Balls.build(surface_points(mesh, _APART_MM))
 
 
 @lru_cache(maxsize=8)
