@@ -330,7 +330,7 @@ def _poses(found: Reconstruction, depths: StoredDepthMaps) -> dict[str, Rigid3]:
 def fusion_for(handpiece: Handpiece, options: ReconstructionOptions) -> FusionOptions:
     """How the depth maps of a handpiece are fused."""
     detail = detail_mm(handpiece)
-    fusion = options.fusion.resolved(detail, handpiece.footprint_mm)
+    fusion = options.fusion.resolve(detail, handpiece.footprint_mm)
     if options.quality != "fine" or options.fusion.voxel_mm is not None:
         return fusion
     return replace(fusion, voxel_mm=_FINE_VOXELS * fusion.voxel_for(detail))
