@@ -17,7 +17,13 @@ from cuspid.model.rig import Handpiece, Light
 from cuspid.model.tolerances import NominalOptions, without_covariances
 from cuspid.motion.bundle.expectation import expectation_of
 from cuspid.motion.bundle.held_calibration import depth_sigma_mm
-from cuspid.motion.icp.surface_tracking import SurfaceTrackingOptions, _drift, _register_icp, adjusted, track_surfaces
+from cuspid.motion.icp.surface_tracking import (
+    SurfaceTrackingOptions,
+    _drift,
+    _register_icp,
+    adjust_poses,
+    track_surfaces,
+)
 from cuspid.motion.icp.surfaces import OrientedPoints, Surface, surface_of
 from cuspid.mvs.matching import coarser
 from cuspid.runtime.errors import ReconstructionError
@@ -127,7 +133,7 @@ def test_a_long_path_that_was_found_bent_is_straightened() -> None:
         pairs = zip(poses, way, strict=True)
         return max(1000 * float(np.linalg.norm((one @ other.inverse()).inverse().translation)) for one, other in pairs)
 
-    straight, _, expected = adjusted(surfaces, bent, SurfaceTrackingOptions(samples=500), 5.0, silent)
+    straight, _, expected = adjust_poses(surfaces, bent, SurfaceTrackingOptions(samples=500), 5.0, silent)
     assert off_um(bent) > 200
     assert 1 < off_um(straight) < 50
     assert expected is not None
@@ -153,7 +159,7 @@ def test_what_a_path_is_off_by_is_expected(errors: Callable[[np.random.Generator
     for seed in range(6):
         rng = np.random.default_rng(seed)
         surfaces, way = strip(20, rng, errors(rng))
-        found, _, expected = adjusted(surfaces, way, SurfaceTrackingOptions(samples=500), 5.0, silent)
+        found, _, expected = adjust_poses(surfaces, way, SurfaceTrackingOptions(samples=500), 5.0, silent)
         assert expected is not None
         frames = np.array_split(expected.points, len(way))
         true = np.concatenate(

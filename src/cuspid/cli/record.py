@@ -26,7 +26,7 @@ from cuspid.footage.played import FilmCamera, RenderedCamera
 from cuspid.footage.quality import measure_quality, shrink_to_grey
 from cuspid.footage.record import Recording, RecordOptions, Status, Together, require_names
 from cuspid.model.board import Board, Target
-from cuspid.report.preview import Preview, marked
+from cuspid.report.preview import Preview, mark_focus
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Options, Range
 from cuspid.runtime.values import checked_name
@@ -227,7 +227,7 @@ class _Watch:
             self._told = advice
             console.print(counts, *news, sep="\n", soft_wrap=True, highlight=False)
         if self._preview is not None:
-            self._preview.show({name: marked(rgb, self._cells(name)) for name, rgb in shown.items()}, advice)
+            self._preview.show({name: mark_focus(rgb, self._cells(name)) for name, rgb in shown.items()}, advice)
         return self._options.until_enough and self._coverage.is_enough(self._enough)
 
     def say_coverage(self) -> None:

@@ -82,7 +82,7 @@ class Features:
         return len(self.pixels)
 
 
-def spread(
+def select_evenly(
     pixels: Float[np.ndarray, "n 2"], strengths: Float[np.ndarray, "n"], count: int, cell_px: int
 ) -> Int[np.ndarray, "m"]:
     """Indices of at most ``count`` keypoints: the strongest of every cell, then the second of every cell, and so on."""
@@ -136,7 +136,7 @@ def detect(
     if options.upright:
         keypoints = without_doubles(keypoints)
     most = options.count_for(width, height)
-    chosen = spread(px * _places(keypoints), np.array([k.response for k in keypoints]), most, options.cell_px)
+    chosen = select_evenly(px * _places(keypoints), np.array([k.response for k in keypoints]), most, options.cell_px)
     keypoints = [keypoints[index] for index in chosen]
     if options.upright:
         for keypoint in keypoints:
@@ -196,8 +196,8 @@ def detect_all(
     stage = None if cache is None else Stage("features", cache / "features", options, (__name__,))
     images = [(frame, camera) for frame in pictures.capture.frames for camera in frame.cameras]
 
-    def kept(image: tuple[Frame, str]) -> Features:
+    def detect_kept(image: tuple[Frame, str]) -> Features:
         return _detect_kept(pictures, *image, options, stage)
 
-    found = map_in_threads(kept, images, stage="features", progress=progress)
+    found = map_in_threads(detect_kept, images, stage="features", progress=progress)
     return {(frame.name, camera): features for (frame, camera), features in zip(images, found, strict=True)}

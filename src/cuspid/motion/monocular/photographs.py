@@ -102,9 +102,9 @@ def locate_photographs(
     with tempfile.TemporaryDirectory() as folder, quiet():
         for plain in (False, True):
             attempt = _attempt(photographs, order, Path(folder), options, plain=plain, progress=progress)
-            if best is None or attempt.located > best.located:
+            if best is None or attempt.located_count > best.located_count:
                 best = attempt
-            if best.located >= options.enough_share * len(order):
+            if best.located_count >= options.enough_share * len(order):
                 break
         assert best is not None
         if not best.models:
@@ -144,7 +144,7 @@ class _Attempt:
     seconds: Mapping[str, float]
 
     @property
-    def located(self) -> int:
+    def located_count(self) -> int:
         """Number of photographs in the largest model."""
         return int(self.models[0].num_reg_images()) if self.models else 0
 
@@ -287,7 +287,7 @@ def _map(
 # --- the lens ----------------------------------------------------------------------------------------------------
 
 
-def refined(model: pycolmap.Reconstruction, held: frozenset[int]) -> tuple[pycolmap.Reconstruction, float]:
+def refine_lenses(model: pycolmap.Reconstruction, held: frozenset[int]) -> tuple[pycolmap.Reconstruction, float]:
     """A model adjusted with as many parameters of the lens as its photographs bear, without what does not fit, and its
     RMS reprojection error, px.
 
@@ -353,7 +353,7 @@ def adjusted_rms(model: pycolmap.Reconstruction) -> float:
 def _to_sparse_model(photographs: Photographs, order: Sequence[Photograph], found: _Attempt) -> PhotoModel:
     numbered = enumerate(photographs.cameras.values(), start=1)
     held = frozenset(number for number, known in numbered if known.calibrated is not None)
-    model, rms = refined(found.models[0], held & set(found.models[0].cameras))
+    model, rms = refine_lenses(found.models[0], held & set(found.models[0].cameras))
     noun = photo_model(photographs, order, model, found.features)
     dropped = (*photographs.left_out, *found.unread, *_unlocated_reasons(order, found))
     counts = {"models": len(found.models), "pairs": len(found.pairs), "points": len(noun.tracks.points)}
@@ -459,7 +459,7 @@ def _notes(photographs: Photographs, model: PhotoModel, found: _Attempt) -> list
     apart = [len(other) for other in others if not other <= placed]
     if apart:
         notes.append(
-            f"the largest of {1 + len(apart)} models is taken, with {found.located} photographs; the others have "
+            f"the largest of {1 + len(apart)} models is taken, with {found.located_count} photographs; the others have "
             f"{', '.join(map(str, apart))}: take photographs between them"
         )
     for name, camera in model.cameras.items():

@@ -238,11 +238,11 @@ def _verified_pairs(
 ) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
     """Verified matches of pairs of frames; pairs that have too few are not in it."""
 
-    def verified(pair: tuple[int, int]) -> pycolmap.TwoViewGeometry | None:
+    def verify(pair: tuple[int, int]) -> pycolmap.TwoViewGeometry | None:
         one, other = (features[index] for index in pair)
         return _verify(camera, one, other, match_unguided(one, other, matching), options)
 
-    found = map_in_threads(verified, pairs, stage="matching", progress=progress)
+    found = map_in_threads(verify, pairs, stage="matching", progress=progress)
     return {pair: geometry for pair, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
 
