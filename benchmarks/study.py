@@ -45,7 +45,7 @@ from cuspid.studies.scanners.inference import compare_scanners, mean_estimate, p
 from cuspid.studies.scanners.scan import StudyOptions, measure_file
 from cuspid.studies.scanners.specimen import Specimen, load_specimen
 from cuspid.studies.scanners.study import Intake, prepare, specimen_of
-from cuspid.studies.scanners.summary import compared, find_common, scan_row
+from cuspid.studies.scanners.summary import compare_scan, find_common, scan_row
 
 JAWS = {
     "teeth3ds/0140W3ND_lower.ply": True,
@@ -102,7 +102,7 @@ def known_errors(jaws: Path, work: Path, count: int) -> list[dict[str, Any]]:
         case, looked_at = truths[scan.specimen, scan.scan]
         specimen = specimen_of(out, scan.specimen)
         common = find_common(specimen, [scan], out / "scans", options)
-        found = compared(scan, out / "scans", specimen, common, options)
+        found = compare_scan(scan, out / "scans", specimen, common, options)
         row = scan_row(found, common)
         rows.append(
             {

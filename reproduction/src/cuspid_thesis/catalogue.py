@@ -185,7 +185,7 @@ def _item(entry: Any, source: str) -> Item:
     return Item(
         **{key: entry[key] for key in _ITEM if key in entry and _ITEM[key] is str},
         pictures=tuple(_picture(pair, where) for pair in entry.get("pictures", ())),
-        printed=tuple(_printed(row, where) for row in entry.get("printed", ())),
+        printed=tuple(_trueness_row(row, where) for row in entry.get("printed", ())),
         rows=tuple(_row(row, entry.get("each", {}), where) for row in entry.get("row", ())),
         notes=tuple(_note(note, where) for note in entry.get("note", ())),
     )
@@ -249,7 +249,7 @@ def _note(entry: Any, where: str) -> Note:
     return Note(**entry)
 
 
-def _printed(entry: Any, where: str) -> TruenessRow:
+def _trueness_row(entry: Any, where: str) -> TruenessRow:
     _check(entry, _PRINTED, set(_PRINTED) - {"tooth"}, where)
     return TruenessRow(**entry | {key: float(entry[key]) for key in entry if key.endswith("_um")})
 

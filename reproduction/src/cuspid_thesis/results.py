@@ -22,7 +22,7 @@ PANORAMA = "panorama/"
 """How the names of results of panoramas begin; then follow subject and method."""
 
 
-def at(result: Result, path: str) -> Any:
+def value_at(result: Result, path: str) -> Any:
     """What stands at a path. Raises KeyError, TypeError, ValueError or IndexError where nothing does."""
     found: Any = result
     for name in path.split("."):
@@ -47,4 +47,4 @@ def looking(where: str) -> Iterator[None]:
 class _Paths(Formatter):
     def get_field(self, field_name: str, args: Any, kwargs: Mapping[str, Any]) -> Any:
         found = kwargs["found"]
-        return found[field_name] if field_name in found else at(kwargs["result"], field_name), field_name
+        return found[field_name] if field_name in found else value_at(kwargs["result"], field_name), field_name

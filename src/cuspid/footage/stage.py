@@ -60,12 +60,12 @@ def survey(films: Films, folder: Path, options: DevelopmentOptions, progress: Pr
     """Measures of each frame, by camera; kept in ``survey/``. Raises InputError where a film changes its image size."""
     stage = Stage("survey", folder, options, _CODE)
 
-    def of(film: Film) -> Looks:
+    def survey_film(film: Film) -> Looks:
         file = folder / "survey" / f"{film.camera}.npz"
         stage.make({"film": film.digest}, [file], lambda: write_arrays(file, vars(_looks(film, options, progress))))
         return Looks(**read_arrays(file, remedy="delete it"))
 
-    return dict(zip(films, map_in_threads(of, films.values()), strict=True))
+    return dict(zip(films, map_in_threads(survey_film, films.values()), strict=True))
 
 
 def _looks(film: Film, options: DevelopmentOptions, progress: Progress) -> Looks:

@@ -95,7 +95,7 @@ class StudyFiles:
     remarks: tuple[Remark, ...] = ()
     """What is odd about them."""
 
-    def of(self, specimen: str) -> tuple[ScanFile, ...]:
+    def scans_of(self, specimen: str) -> tuple[ScanFile, ...]:
         """The scans of a specimen."""
         return tuple(scan for scan in self.scans if scan.specimen == specimen)
 
@@ -123,7 +123,7 @@ def without_repeats(files: StudyFiles, digests: Mapping[str, str]) -> StudyFiles
     return StudyFiles(scans=tuple(kept), references=files.references, remarks=(*files.remarks, *remarks))
 
 
-def beside(reference: Path, endings: Sequence[str]) -> Path | None:
+def find_beside(reference: Path, endings: Sequence[str]) -> Path | None:
     """The first file that is named after a reference with one of the endings; None where there is none."""
     paths = (reference.with_name(reference.stem + ending) for ending in endings)
     return next((path for path in paths if is_there(path)), None)
@@ -131,25 +131,27 @@ def beside(reference: Path, endings: Sequence[str]) -> Path | None:
 
 def area_file(reference: Path) -> Path | None:
     """The mesh of the reference area of a specimen."""
-    return beside(reference, [f".area{suffix}" for suffix in MESH_SUFFIXES])
+    return find_beside(reference, [f".area{suffix}" for suffix in MESH_SUFFIXES])
 
 
 def body_file(reference: Path) -> Path | None:
     """The library mesh of the scan bodies of a specimen."""
-    own = beside(reference, [f".scanbody{suffix}" for suffix in MESH_SUFFIXES])
+    own = find_beside(reference, [f".scanbody{suffix}" for suffix in MESH_SUFFIXES])
     common = (reference.with_name(f"{_COMMON_BODY}{suffix}") for suffix in MESH_SUFFIXES)
     return own or next((path for path in common if is_there(path)), None)
 
 
 def landmark_file(mesh: Path) -> Path | None:
     """The landmarks of a scan or a reference."""
-    return beside(mesh, (".landmarks.json", MARKUPS_SUFFIX))
+    return find_beside(mesh, (".landmarks.json", MARKUPS_SUFFIX))
 
 
 def belongings(reference: Path) -> tuple[Path, ...]:
     """All files that tell what a specimen is, the reference first."""
     others = (area_file(reference), body_file(reference), landmark_file(reference))
-    tables = (beside(reference, [ending]) for ending in (".spheres.csv", ".bodies.csv", "_facelabels.npy", ".json"))
+    tables = (
+        find_beside(reference, [ending]) for ending in (".spheres.csv", ".bodies.csv", "_facelabels.npy", ".json")
+    )
     return (reference, *(path for path in (*others, *tables) if path is not None))
 
 

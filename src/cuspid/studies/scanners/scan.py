@@ -100,7 +100,7 @@ def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> M
     mesh, told = _read(scan, specimen)
     rough = _register(mesh, specimen, options)
     samples, _ = mesh.sample(options.samples, np.random.default_rng([options.seed, 1]))
-    pose, parts, missed = _aligned(scan, mesh, samples, specimen, rough.reference_from_scan, options)
+    pose, parts, missed = _align(scan, mesh, samples, specimen, rough.reference_from_scan, options)
     aligned = mesh.transformed(pose)
     points = pose.apply(samples)
     against = SignedDistance(aligned)
@@ -180,7 +180,7 @@ def _found_fast(mesh: Mesh, surface: SignedDistance, options: RegistrationOption
 Parts = dict[tuple[str, str], Station]
 
 
-def _aligned(
+def _align(
     scan: ScanFile,
     mesh: Mesh,
     samples: Float[np.ndarray, "s 3"],
