@@ -231,9 +231,9 @@ class Voter:
     """Number of its frame, starting from 1."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Votes:
-    """What the depth maps say about each vertex of a rough mesh; accumulated map by map."""
+    """What the depth maps say about each vertex of a rough mesh. Not frozen: it is an accumulator."""
 
     rough: Mesh
     """The zero level of the volume."""
