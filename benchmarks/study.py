@@ -5,7 +5,7 @@
 JAWS holds meshes of real jaws (half of those below were looked at only when all was done). Parts: ``errors`` (scale,
 bends, noise, a dent, holes, other triangles, cut borders; each moved at random), ``one_end`` (aligned at one end of a
 bent arch, read at the other), ``coverage`` (intervals of 200 simulated studies), ``bodies`` (scan bodies with noise and
-a third missing), ``cloudcompare`` (distances beside CloudCompare's), ``speed`` (a share of 120 scans of 300 000 faces).
+a third missing), ``cloudcompare`` (distances beside CloudCompare's), ``speed`` (120 scans of 300 000 faces).
 What each part found is kept in the work folder.
 """
 
@@ -58,7 +58,7 @@ JAWS = {
     "teeth3ds/Q5GSR6N2_lower.ply": False,
 }
 """Whether the jaw was looked at while the code was written."""
-STUDIES, LARGE_FACES, SPEED_SCANS = 200, 300_000, 12
+STUDIES, LARGE_FACES, SPEED_SCANS = 200, 300_000, 120
 LEAST_PIECE = 500
 """Places on a piece that is aligned or read."""
 
