@@ -418,7 +418,9 @@ def test_the_page_of_a_calibration(tmp_path):
     write_calibrated(tmp_path)
     page = report_page(storage.read_result(tmp_path))
     assert "<other>" not in page
-    for said in ("&lt;other&gt;", "960", "+0.25 ± 0.10", "gamma stays", "3.000", "1.020 ± 0.3 %", "0.08"):
+    for said in ("+0.25 ± 0.10 (+12.5 ms)", "+0.312 ± 0.004 (+15.6 ms)"):
+        assert said in page, said
+    for said in ("&lt;other&gt;", "960", "gamma stays", "3.000", "1.020 ± 0.3 %", "0.08"):
         assert said in page, said
     assert page.count("<img") == 1
     drawn = storage.read_handpiece(tmp_path / "handpiece.json")

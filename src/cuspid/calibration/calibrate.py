@@ -79,6 +79,8 @@ class CalibrationOptions(Options):
     """auto: where a filmed board moves, it is estimated how long after the first row of an image the last one is
     exposed, and kept if that explains images that it was not estimated from. global: all rows are exposed at once."""
 
+    frames_per_s: Annotated[float | None, Range(0.001, 100_000)] = None
+    """Rate at which the board was filmed, to tell delays and readouts in ms too; default: that which videos state."""
     outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
     """A view is left out if the RMS of its residuals is beyond this, in standard deviations of all residuals or of its
     camera's."""
@@ -155,6 +157,8 @@ class RigCalibration:
     """Pose of the board when each view of it was taken, by camera and instant."""
     distance_mm: float
     """Median distance of the board from the cameras."""
+    frames_per_s: float | None = None
+    """Rate at which the board was filmed; None where nothing states it."""
     notes: tuple[str, ...]
     """What was left out and why, one line each."""
 
@@ -213,7 +217,7 @@ def _calibrate_once(
 
     def attempt(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
         found, chosen, notes = _fit_cameras(scene, common, board, options)
-        return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes)))
+        return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes), options.frames_per_s))
 
     best = _with_timing(attempt(start), start, common, board, options, attempt)
     splined = _find_splines(best, choices, board) if options.lens == "auto" else {}
@@ -503,6 +507,7 @@ def _describe(
     board: Target,
     lenses: Mapping[str, LensChoice],
     notes: tuple[str, ...],
+    frames_per_s: float | None,
 ) -> RigCalibration:
     names, views = list(found.scene.cameras), {key: chosen[key] for key in found.residuals}
     of = {name: [key for key in views if key[0] == name] for name in names}
@@ -546,7 +551,8 @@ def _describe(
         views=views,
         rig_from_view=seen,
         distance_mm=float(np.median(distances)),
-        notes=(*notes, *_of_board(found.scene), *_doubts(found.settled, checks, rig)),
+        frames_per_s=frames_per_s,
+        notes=(*notes, *_of_board(found.scene), *_of_time(checks, frames_per_s), *_doubts(found.settled, checks, rig)),
     )
 
 
@@ -637,13 +643,15 @@ def _of_board(scene: BoardScene) -> Iterator[str]:
         )
 
 
-def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
-    """Where the search did not end; where the lens or the board is not what the model says, or the cameras were not
-    triggered together; where the views leave the focal length open."""
-    if not settled:
-        yield "the adjustment did not converge; its results may be wrong"
+def _of_time(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> Iterator[str]:
+    """Where the cameras do not expose together, or not all of their rows."""
+
+    def told(name: str, frames: float, sigma: float | None, digits: int) -> str:
+        in_ms = "" if frames_per_s is None else f" ({1000 * frames / frames_per_s:+.1f} ms)"
+        return f"{name} {frames:+.{digits}f} ± {sigma:.{digits}f}{in_ms}"
+
     delays = [
-        f"{name} {check.delay_frames:+.2f} ± {check.delay_spread_frames:.2f}"
+        told(name, check.delay_frames, check.delay_spread_frames, 2)
         for name, check in checks.items()
         if check.delay_frames is not None
     ]
@@ -653,15 +661,20 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
             f"{', '.join(delays)}; this is taken into account, but a board that is held still gives more"
         )
     readouts = [
-        f"{name} {check.readout:+.3f} ± {check.readout_sigma:.3f}"
-        for name, check in checks.items()
-        if check.readout is not None
+        told(name, check.readout, check.readout_sigma, 3) for name, check in checks.items() if check.readout is not None
     ]
     if readouts:
         yield (
             "the cameras do not expose all rows at once; by the motion of the board, from the first row to the last, "
             f"as a share of the time between frames: {', '.join(readouts)}; this is taken into account"
         )
+
+
+def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
+    """Where the search did not end; where the lens or the board is not what the model says, or the cameras were not
+    triggered together; where the views leave the focal length open."""
+    if not settled:
+        yield "the adjustment did not converge; its results may be wrong"
     for name, check in checks.items():
         worst = max(check.parameters_apart or 0.0, check.place_apart or 0.0)
         if worst > _DOUBTFUL:

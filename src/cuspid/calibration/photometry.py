@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from cuspid.calibration.bundle import bending_coordinates
 from cuspid.calibration.calibrate import RigCalibration, require_covariance
@@ -41,11 +41,11 @@ from cuspid.calibration.shading import (
 )
 from cuspid.model.board import Board
 from cuspid.model.rig import Handpiece, Light, Sensor, falloff_terms
+from cuspid.runtime.image_files import Pixels
 from cuspid.runtime.options import Range
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import map_in_threads
 
-Image = UInt8[np.ndarray, "h w 3"]
 ViewPatches = Mapping[tuple[str, str], Patches]
 """Patches by camera and instant."""
 
@@ -146,7 +146,7 @@ class Photometry:
 
 def look_at_patches(
     found: RigCalibration,
-    image: Callable[[str, str], Image],
+    image: Callable[[str, str], Pixels],
     board: Board,
     options: PhotometryOptions,
     *,

@@ -195,6 +195,7 @@ def _figures(found: RigCalibration, board: Target) -> dict[str, object]:
         **(bent if board.terraces == 1 else steps),
         **({"boards": _boards(found, board)} if isinstance(board, BoardSet) else {}),
         "board_distance_mm": found.distance_mm,
+        "frames_per_s": found.frames_per_s,
         "cameras": {
             name: {**asdict(each), "widened": found.widened[name], "lens": _lens_figures(found.lenses[name])}
             for name, each in found.cameras.items()

@@ -71,8 +71,8 @@ class OpticsOptions(Options):
     """How far the handpiece moves during an exposure."""
     readout: Annotated[float | None, SHARE] = None
     """Rolling shutter: share (0 to 1) of the time from one frame to the next in which the rows are exposed one after
-    the other; 0 for all at once. The true pose of a frame is that of its middle. The capture's handpiece.json says so
-    (``readout``)."""
+    the other (the readout time of the sensor in s, times frames per s); 0 for all at once. The true pose of a frame is
+    that of its middle. The capture's handpiece.json says so (``readout``)."""
     delays_frames: Annotated[tuple[float, ...], Range(-1, 1)] = ()
     """How much later than the others each camera exposes, in the order of the handpiece, in shares of the time from one
     frame to the next; none for all together. The capture's handpiece.json says so (``delay_frames``)."""
