@@ -33,8 +33,10 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# A warning, as of a link that leads nowhere, is an error, and so is a command on a page, or an example, that does not run.
+# A warning, as of a link that leads nowhere, is an error, and so is a command on a page, or an example, that does not
+# run, or a figure that is not that of the results.
 docs: $(STAMP).docs
+	$(BIN)/python benchmarks/quoted.py --check
 	$(BIN)/sphinx-build --quiet --fail-on-warning --doctree-dir build/doctrees docs build/docs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m documentation tests/test_docs.py tests/test_examples.py
 	@echo "build/docs/index.html"

@@ -78,7 +78,7 @@ MAKERS: Mapping[str, Maker] = {
     "jaws_*": Maker("jaws"),
     "enamel": Maker("enamel", plain=True),
     "plain_frames": Maker("plain_frames", plain=True),
-    "real": Maker("real", ("scan",), runs=("real_runs",), plain=True),
+    "real": Maker("real", ("scan",), runs=("real_runs",), plain=True, release=True),
     "cast": Maker("cast", ("scan",)),
     "real_gloss": Maker("real_gloss", plain=True),
     "manufacturing*": Maker("manufacturing"),

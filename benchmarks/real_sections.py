@@ -14,7 +14,7 @@ _TIME_S, _MEMORY_GIB = 90.0, 4.0
 
 
 def real(result: Result) -> str:
-    """How each set ended, and what is known of its surface and its poses."""
+    """What is known of the surface and the poses of each set, and how it ended."""
     scans = result["scans"]
     head = (
         "set",
@@ -26,13 +26,10 @@ def real(result: Result) -> str:
         "faces",
         "pixels with depth %",
     )
-    rows = [_run_row(name, scan) for name, scan in scans.items()]
     parts = [
         "Sets of real photographs that are not part of the project, reconstructed by default options on the command "
         "line. *SGBM*: OpenCV's StereoSGBM on each view and its nearest neighbour, fused by the same fusion; *COLMAP*: "
         "its mapper by its defaults. The truth is only used here. `python benchmarks/real.py`.",
-        "",
-        markdown_table(head, rows),
     ]
     for kind, (title, heads, figures) in _KINDS.items():
         rows = [
@@ -40,6 +37,8 @@ def real(result: Result) -> str:
         ]
         if rows:
             parts += ["", f"{title}", "", markdown_table(("set", "method", *heads), rows)]
+    ended = markdown_table(head, [_run_row(name, scan) for name, scan in scans.items()])
+    parts += ["", "How each run ended:", "", ended]
     return "\n".join(parts)
 
 

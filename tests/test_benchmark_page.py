@@ -258,3 +258,69 @@ def test_a_path_is_counted_by_its_films_and_those_without_an_arch_are_within_no_
     swung = [film("a", 0.1, -2.0), film("b", 0.15, 3.0, complete=False), {"subject": "c", "score": None}]
     row = import_module("panorama_sections").path_row("s-shape", swung, {each["subject"]: each for each in one_pass})
     assert row == ["`s-shape`", "3", "0.12 (0.10-0.15)", "0.38 (0.30-0.45)", "1", "2", "1", "1", "1 of 2"]
+
+
+def test_the_page_begins_with_real_photographs_misses_included(freshness):
+    page = import_module("page")
+    results = page.read(ROOT / "benchmarks" / "results")
+    lines = page.benchmarks(of_release(freshness, results), {}).splitlines()
+    table = next(k for k, line in enumerate(lines) if line.startswith("|"))
+    assert [line for line in lines[:table] if line.startswith("## ")] == ["## Real photographs"]
+    assert "(missed)" in "\n".join(lines[table : lines.index("", table)])
+
+
+# --- figures that people quote ----------------------------------------------------------------------------------------
+
+
+def test_pages_quote_what_the_results_say(freshness, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["quoted.py", "--check"])
+    import_module("quoted").main()
+
+
+QUOTED = {"mean {} µm, {} s\nfor {};": ["tooth-*: found/mean .1f", "tooth-a: s .0f * 60", "tooth-*: found/mean <= 2"]}
+RESULTS = {"tooth-a": {"found": {"mean": 1.04}, "s": 2}, "tooth-b": {"found": {"mean": -1.96}}, "arch": {"s": 7}}
+
+
+def test_figures_are_put_into_a_page_wherever_its_lines_are_broken(freshness):
+    quoted = import_module("quoted")
+    page = "It is mean 9 µm, 8\ns for good; 7 of 6.\n"
+    assert quoted.with_figures(page, QUOTED, RESULTS) == "It is mean 1.0-2.0 µm, 120\ns for met; 7 of 6.\n"
+    worse = RESULTS | {"tooth-b": {"found": {"mean": -2.04}}}
+    assert "for missed;" in quoted.with_figures(page, QUOTED, worse)
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("a: x/*/y .1f median", "3.0"),
+        ("a: x/*/y .1f max", "8.0"),
+        ("a: x/*/y .2f rms", "4.97"),
+        ("a: x/p/y & a: x/q/y .0f", "1-3"),
+        ("a: x/r/y .0f", "8"),
+        ("a: x/*/y >= 1 and a: x/r/y <= 8", "met"),
+        ("a: x/*/y >= 1 and a: x/r/y <= 7.9", "missed"),
+    ],
+)
+def test_what_a_source_says(freshness, source, told):
+    results = {"a": {"x": {"p": {"y": 1}, "q": {"y": -3}, "r": [{"y": 8}, {"y": None}]}}}
+    assert import_module("quoted").with_figures("so {}.", {"so {}.": [source]}, results) == f"so {told}."
+
+
+@pytest.mark.parametrize(
+    ("page", "changed", "said"),
+    [
+        ("nothing", {}, "0 times on the page"),
+        ("a 1; a 2;", {}, "2 times on the page"),
+        ("a 1;", {"a {};": ["b: x .1f"]}, "no result has b: x"),
+        ("a 1;", {"a {};": ["a: z .1f"]}, "no result has a: z"),
+        ("a 1;", {"a {};": ["a: x"]}, "neither a figure nor a bar"),
+        ("a 1;", {"a {};": []}, "0 sources"),
+        ("a 1;", {"a {}": ["a: x .1f"]}, "words at its end"),
+        ("| h |\n|---|\n| a 1; |\n| words |\n| b 2; |\n", {}, "| b 2; |: not in quoted.toml"),
+    ],
+)
+def test_a_figure_without_a_result_is_refused(freshness, page, changed, said):
+    quoted = import_module("quoted")
+    with pytest.raises(quoted.WrongFigureError) as caught:
+        quoted.with_figures(page, changed or {"a {};": ["a: x .1f"]}, {"a": {"x": 1}})
+    assert said in str(caught.value)

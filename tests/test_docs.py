@@ -6,6 +6,8 @@ import functools
 import importlib
 import importlib.util
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -69,6 +71,23 @@ def is_understood(arguments: list[str], capsys) -> bool:
     """Whether nothing is wrong with a command but what it leaves out."""
     said = refused(arguments, capsys)
     return said is None or ("Missing from" in said and "Unrecognized" not in said)
+
+
+@pytest.mark.long
+def test_every_command_of_version_02_works_or_tells_its_successor(parsed, capsys):
+    """Those of its README, one a line; the page on what has changed lists the successors."""
+    page, makefile = (ROOT / "docs/from-0.2.md").read_text(), (ROOT / "Makefile").read_text()
+    given = [shlex.split(line) for line in (ROOT / "tests/support/commands-of-0.2.txt").read_text().splitlines()]
+    verbs = [arguments for program, *arguments in given if program == "cuspid"]
+    for arguments in verbs:
+        said = refused(arguments, capsys)
+        if said is not None:
+            (answer,) = said.splitlines()
+            successor = re.search(rf"{arguments[0]} is now called ([a-z ]+):", answer)[1]
+            assert f"| `{arguments[0]}` | `{successor}`" in page
+            assert refused([*successor.split(), *arguments[1:]], capsys) is None, answer
+    assert len(parsed) == len(verbs) > 30
+    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for program, target, *_ in given if program == "make")
 
 
 @pytest.mark.parametrize("wrong", ["run --tooht 46 --out scan/", "scan --out scan/", "run --tooth six --out scan/"])

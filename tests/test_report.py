@@ -33,7 +33,15 @@ from cuspid.report.figures.drawing import (
     fitting_sigma_um,
 )
 from cuspid.report.pages.color_scale import deviation_scale, sigma_scale
-from cuspid.report.pages.page import LARGEST_PAGE_BYTES, flat_settings, number, pack_array, script_json, signed_number
+from cuspid.report.pages.page import (
+    LARGEST_PAGE_BYTES,
+    asset,
+    flat_settings,
+    number,
+    pack_array,
+    script_json,
+    signed_number,
+)
 from cuspid.report.pages.report import report_page
 from cuspid.report.pages.scan import ReportOptions, histogram, worst_places
 from cuspid.report.pages.scene import camera_lines
@@ -635,3 +643,31 @@ def test_what_cannot_be_viewed(tmp_path, monkeypatch, capsys, scan_folder):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(MissingDependencyError, match=r"cuspid\[view\]"):
         live_view.serve(storage.read_result(scan_folder), "127.0.0.1", 18081)
+
+
+# --- colours of a page ------------------------------------------------------------------------------------------------
+
+
+def luminance(color: str) -> float:
+    """Relative luminance as WCAG 2 defines it."""
+    digits = color if len(color) == 6 else "".join(2 * each for each in color)
+    shares = np.array([int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)])
+    linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    return float(np.dot([0.2126, 0.7152, 0.0722], linear))
+
+
+def contrast(one: str, other: str) -> float:
+    high, low = sorted((luminance(one), luminance(other)), reverse=True)
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("theme", [0, 1], ids=["light", "dark"])
+def test_what_is_written_stands_out(theme):
+    """Text by 4.5 (WCAG 2.2, AA), borders of what one presses by 3."""
+    declared = re.findall(r"(?m)^ *:root[^{]*\{([^}]*)\}", asset("page.css"))
+    assert len(declared) == 2
+    named = dict(re.findall(r"--([\w-]+): #(\w{3}|\w{6});", declared[theme]))
+    for ground in ("ground", "card", "lit", "warn"):
+        assert min(contrast(named[ink], named[ground]) for ink in ("ink", "soft", "accent")) >= 4.5, ground
+    assert contrast(named["on-accent"], named["accent"]) >= 4.5
+    assert contrast(named["edge"], named["card"]) >= 3

@@ -45,6 +45,16 @@ PICTURE = """async () => {
 }"""
 
 
+STOP = """() => {
+  const each = document.activeElement;
+  if (!each || each === document.body) return null;
+  const name = each.ariaLabel || each.labels?.[0]?.textContent || each.textContent;
+  const { outlineStyle, outlineWidth } = getComputedStyle(each);
+  return { tag: each.tagName, name: name.trim(), outline: outlineStyle === "none" ? 0 : parseFloat(outlineWidth) };
+}"""
+"""What the keyboard is at, None past the end of the page."""
+
+
 @dataclass
 class Visit:
     """A page that was opened, and what the browser said meanwhile."""
@@ -206,6 +216,31 @@ def test_turning_changes_the_picture_and_reset_brings_it_back(fresh):
     assert differing(before, fresh.picture()) < 0.002
 
 
+def test_the_keys_turn_move_zoom_and_read(fresh):
+    """Each key and its opposite leave the view as it was; the arrow to the right moves the surface there."""
+    fresh.page.locator("canvas").focus()
+
+    def typed(*keys: str) -> np.ndarray:
+        for key in keys:
+            fresh.page.keyboard.press(key)
+        return fresh.picture()
+
+    def middle(picture: np.ndarray) -> float:
+        return float(np.nonzero(picture[..., 3])[1].mean())
+
+    before = fresh.picture()
+    for key, opposite in (("ArrowRight", "ArrowLeft"), ("ArrowUp", "ArrowDown"), ("+", "-")):
+        assert differing(before, typed(key)) > 0.02
+        assert differing(before, typed(opposite)) < 0.002
+    moved = typed("Shift+ArrowRight")
+    assert 0.05 < (middle(moved) - middle(before)) / before.shape[0] < 0.2
+    assert differing(before, typed("Shift+ArrowLeft")) < 0.002
+    typed("+", "ArrowUp")
+    assert differing(before, typed("0")) < 0.002
+    typed("Enter")
+    assert "µm" in fresh.page.locator(".readout").inner_text()
+
+
 def test_the_wheel_zooms_and_the_length_bar_follows(fresh):
     def millimetres_per_px() -> float:
         length = float(fresh.page.locator(".length b").inner_text().split()[0])
@@ -331,6 +366,38 @@ def test_a_wide_table_fits_on_paper_and_is_moved_on_a_screen(browser, pages):
     study.page.context.close()
 
 
+def test_tables_are_sorted_and_moved_by_the_keys(browser, pages):
+    study = visit(browser, pages["comparison"], viewer=False, viewport=PHONE)
+    head = study.page.locator(".sorted thead th").nth(1)
+    for order in ("ascending", "descending"):
+        head.locator("button").focus()
+        study.page.keyboard.press("Enter")
+        assert head.get_attribute("aria-sort") == order
+    box = study.page.locator(".scroll", has=study.page.locator(".sorted"))
+    study.page.wait_for_selector(".scroll[aria-label='All cases'][tabindex]")
+    box.focus()
+    study.page.keyboard.press("ArrowRight")
+    study.page.wait_for_function("() => document.querySelector('.scroll:focus').scrollLeft > 0")
+    study.page.context.close()
+
+
+def test_every_control_has_a_name_and_shows_where_the_keyboard_is(browser, pages):
+    """Of every kind of page, in the dark, where the page is dark and what is drawn is not."""
+    for name, path in pages.items():
+        found = visit(browser, path, viewer=name in ("scan", "shape"), color_scheme="dark")
+        assert found.page.locator("main, header, footer").count() == 3
+        stops = 0
+        while (stop := (found.page.keyboard.press("Tab"), found.page.evaluate(STOP))[1]) and stops < 100:
+            assert stop["name"], stop
+            assert stop["outline"] >= 2, stop
+            stops += 1
+        assert stops > 3
+        assert (
+            max(found.page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")) < 60
+        )
+        found.page.context.close()
+
+
 def test_on_a_phone(browser, pages):
     phone = visit(browser, pages["scan"], viewport=PHONE, has_touch=True, is_mobile=True, device_scale_factor=2)
     assert phone.page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
@@ -361,6 +428,7 @@ def test_two_clicks_on_a_panorama_measure_and_tell_how_to_scale_it(browser, tmp_
     cli.main(["report", str(tmp_path / "pano 1")])
     visited = visit(browser, tmp_path / "pano 1" / "report.html", viewer=False)
     page, output = visited.page, visited.page.locator("[data-measures] output")
+    page.locator(".zoomed img[style*=width]").wait_for()
     box = page.locator(".zoomed img").bounding_box()
 
     def at(across: float, down: float) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import lazy_loader
 
 from cuspid.runtime.display import draw_with, view_with
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 draw_with(lambda value: import_module("cuspid.report.notebook").to_html(value))
 view_with(lambda value, port: import_module("cuspid.report.live_view").show_value(value, port))

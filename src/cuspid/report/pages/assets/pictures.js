@@ -25,6 +25,24 @@
       }
     });
   }
+  const STEP_PX = 40;
+  const keys = {
+    ArrowLeft: (zoom) => zoom.pan(STEP_PX / zoom.getScale(), 0, { relative: true }),
+    ArrowRight: (zoom) => zoom.pan(-STEP_PX / zoom.getScale(), 0, { relative: true }),
+    ArrowUp: (zoom) => zoom.pan(0, STEP_PX / zoom.getScale(), { relative: true }),
+    ArrowDown: (zoom) => zoom.pan(0, -STEP_PX / zoom.getScale(), { relative: true }),
+    "+": (zoom) => zoom.zoomIn(),
+    "-": (zoom) => zoom.zoomOut(),
+    0: (zoom) => zoom.reset({ animate: false }),
+  };
+  for (const frame of document.querySelectorAll(".zoomed")) {
+    frame.addEventListener("keydown", (event) => {
+      const act = keys[event.key];
+      if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      groups.get(frame.dataset.group).forEach(act);
+    });
+  }
   for (const button of document.querySelectorAll("[data-zoom]")) {
     button.addEventListener("click", () => {
       for (const each of groups.get(button.dataset.group)) {

@@ -275,9 +275,12 @@
   // What a click reads: the values that are coloured, or without colours those that were first.
   const readable = () => scale ?? scene.scales[0];
 
-  function read(event) {
+  function placeOf(event) {
     const box = canvas.getBoundingClientRect();
-    const at = new THREE.Vector2((2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height);
+    return new THREE.Vector2((2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height);
+  }
+
+  function read(at) {
     const ray = new THREE.Raycaster();
     ray.setFromCamera(at, camera);
     const surfaces = [...layers.values()].filter((each) => each.isMesh && each.visible && each.userData.values[readable()?.name]);
@@ -291,6 +294,51 @@
     const where = hit.point.toArray().map((each) => each.toFixed(2)).join(", ");
     const text = value === UNKNOWN ? "not known" : `${signed && amount > 0 ? "+" : ""}${amount.toFixed(unit === "mm" ? 3 : 1)} ${unit}`;
     readout.textContent = `${text}  at ${where} ${lengthUnit}`.replace(/-/g, "−");
+  }
+
+  // --- keys ----------------------------------------------------------------------------------------------------------
+
+  const TURN = Math.PI / 24;
+  const STEP = 0.1;
+
+  const axisOf = (column) => new THREE.Vector3().setFromMatrixColumn(camera.matrixWorld, column);
+
+  // The surface follows the arrows, which means that the camera goes the other way.
+  function turn([right, up]) {
+    const about = axisOf(0).multiplyScalar(up).addScaledVector(axisOf(1), -right);
+    const eye = camera.position.clone().sub(controls.target).applyAxisAngle(about, TURN);
+    camera.up.copy(axisOf(1)).applyAxisAngle(about, TURN);
+    camera.position.copy(controls.target).add(eye);
+    camera.lookAt(controls.target);
+  }
+
+  function move([right, up]) {
+    const size = (-STEP * 2 * half) / camera.zoom;
+    const by = axisOf(0).multiplyScalar(size * right).addScaledVector(axisOf(1), size * up);
+    camera.position.add(by);
+    controls.target.add(by);
+  }
+
+  function zoom(factor) {
+    camera.zoom *= factor;
+    camera.updateProjectionMatrix();
+  }
+
+  const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+  const zooms = { "+": 1.2, "=": 1.2, "-": 1 / 1.2 };
+
+  function onKey(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const [arrow, factor] = [arrows[event.key], zooms[event.key]];
+    if (event.key === "0") find("[data-reset]").click();
+    else if (event.key === "Enter") read(new THREE.Vector2());
+    else if (arrow) (event.shiftKey ? move : turn)(arrow);
+    else if (factor) zoom(factor);
+    else return;
+    if (arrow || factor) home = null;
+    event.preventDefault();
+    camera.updateMatrixWorld();
+    change();
   }
 
   // --- buttons -------------------------------------------------------------------------------------------------------
@@ -374,8 +422,9 @@
     let down = null;
     canvas.addEventListener("pointerdown", (event) => (down = [event.clientX, event.clientY]));
     canvas.addEventListener("pointerup", (event) => {
-      if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 4) read(event);
+      if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 4) read(placeOf(event));
     });
+    canvas.addEventListener("keydown", onKey);
     addEventListener("beforeprint", snapshot);
   }
 
