@@ -36,7 +36,7 @@ format: $(STAMP)
 # A warning, as of a link that leads nowhere, is an error, and so is a command on a page, or an example, that does not run.
 docs: $(STAMP).docs
 	$(BIN)/sphinx-build --quiet --fail-on-warning --doctree-dir build/doctrees docs build/docs
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m documentation tests/test_docs.py tests/test_examples.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m documentation tests/whole/test_docs.py tests/whole/test_examples.py
 	@echo "build/docs/index.html"
 
 # As users get it: in an environment of its own, far from the sources.
