@@ -152,7 +152,7 @@ def judge(
             room.clearance(pose)[0] for each in (path, *others) for pose in each.rig_from_world.values()
         ),
         "seeds": seeds,
-        "minimum_overlap_pct": 100 * path.minimum_overlap,
+        "minimum_overlap_pct": 100 * path.min_overlap,
         "seen_pct": 100 * path.seen[GUM],
     }
     if plan_only:

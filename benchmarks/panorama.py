@@ -51,7 +51,7 @@ PHANTOMS: tuple[tuple[GroupName, int], ...] = (
 """Groups of the population and how many jaws of each."""
 EDGE_MM = 0.25
 """Edge of the phantoms' faces, and about that to which other jaws are subdivided."""
-FEWEST_FRAMES_PCT = PanoramaEvaluationOptions().fewest_frames_pct
+FEWEST_FRAMES_PCT = PanoramaEvaluationOptions().min_frames_pct
 CLICK_MM, TRACED = 0.1, 300_000
 """How far beside a cusp one clicks (one standard deviation), and of how many pixels the cusps are those of."""
 SUPERSAMPLING = 1

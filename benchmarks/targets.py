@@ -52,7 +52,7 @@ def judge(*, board: str, tilt_deg: float, seed: int, instants: int, pixels: int)
     true = built(
         six_cameras(DesignOptions(width_px=pixels, height_px=pixels)), replace(TOLERANCES, manufacturing_seed=seed)
     )
-    shown = PhotographOptions(instants=instants, most_tilt_deg=tilt_deg, supersampling=2, seed=seed)
+    shown = PhotographOptions(instants=instants, max_tilt_deg=tilt_deg, supersampling=2, seed=seed)
     with TemporaryDirectory(prefix="cuspid-target-") as folder:
         take_photographs(true, BOARDS[board], Path(folder), shown)
         views = views_in(Path(folder) / "images", BOARDS[board])

@@ -150,14 +150,12 @@ def test_each_test_of_the_examination_names_its_reason(homography: np.ndarray, n
 
 
 def test_the_limits_of_the_examination_are_options() -> None:
-    lenient = ExaminationOptions(
-        smallest_angle_deg=50.0, largest_angle_deg=130.0, largest_translation=0.5, smallest_scale=0.7
-    )
+    lenient = ExaminationOptions(min_angle_deg=50.0, max_angle_deg=130.0, max_translation=0.5, min_scale=0.7)
     for homography in (about_centre([[1, 0.4], [0, 1]]), about_centre([[0.8, 0], [0, 0.8]], (200, 0))):
         assert examine(homography, SIZE, ExaminationOptions())
         assert not examine(homography, SIZE, lenient)
     with pytest.raises(InputError, match="angle-deg"):
-        ExaminationOptions(smallest_angle_deg=95.0)
+        ExaminationOptions(min_angle_deg=95.0)
 
 
 @given(st.floats(-3, 3), st.floats(0.2, 5), st.floats(-0.3, 0.3))
@@ -324,7 +322,7 @@ def test_a_black_frame_ends_nothing_and_black_frames_alone_are_refused(pan: Path
 def test_what_collapses_is_a_part_and_said_to_be_one(pan: Path) -> None:
     sequence = storage.read_sequence(pan, pan / "decoded")
     small = 0.0513  # Enough for three frames.
-    first, *others = stitched(pan, largest_canvas_mpx=small)
+    first, *others = stitched(pan, max_canvas_mpx=small)
     assert others
     assert first.parts == 1 + len(others)
     assert first.covered.size <= 1e6 * small

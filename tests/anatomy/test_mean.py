@@ -235,8 +235,8 @@ def test_size_is_shape_unless_scaled(base: Jaw) -> None:
         return replace(base, mesh=Mesh(factor * base.mesh.vertices, base.mesh.faces), landmarks=landmarks)
 
     jaws = {f"{factor:g}": sized(factor) for factor in (0.95, 1.0, 1.05)}
-    kept = mean_shape(jaws, MeanShapeOptions(most_rounds=1))
-    scaled = mean_shape(jaws, MeanShapeOptions(most_rounds=1, scale=True))
+    kept = mean_shape(jaws, MeanShapeOptions(max_rounds=1))
+    scaled = mean_shape(jaws, MeanShapeOptions(max_rounds=1, scale=True))
     assert kept.standard_deviations_mm[0] == pytest.approx(0.05 * _rms_radius(base), rel=0.02)
     assert scaled.standard_deviations_mm.max(initial=0) < 1e-3
     assert scaled.scales * [0.95, 1.0, 1.05] == pytest.approx([1.0] * 3)
@@ -251,7 +251,7 @@ def _rms_radius(jaw: Jaw) -> float:
 
 
 def test_landmarks_alone_keep_the_detail_of_the_first_sample(population: Population) -> None:
-    model = mean_shape(population.jaws, MeanShapeOptions(correspondence="landmarks", most_rounds=2))
+    model = mean_shape(population.jaws, MeanShapeOptions(correspondence="landmarks", max_rounds=2))
     assert model.log[0].change_um < 1e-6
     assert model.correspondence == "landmarks"
 
@@ -262,7 +262,7 @@ def test_a_tooth_that_a_jaw_lacks_is_named(population: Population) -> None:
     labels = np.where(part.face_labels == 35, GUM, part.face_labels)
     landmarks = {label: point for label, point in part.landmarks.items() if not label.startswith("35.")}
     part = replace(part, face_labels=labels, landmarks=landmarks)
-    model = mean_shape({"whole": whole, "part": part}, MeanShapeOptions(first="whole", most_rounds=1))
+    model = mean_shape({"whole": whole, "part": part}, MeanShapeOptions(first="whole", max_rounds=1))
     assert any("part has no tooth 35" in note for note in model.notes)
     assert any("35.a" in note for note in model.notes)
     assert 35 in model.mean.teeth

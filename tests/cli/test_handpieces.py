@@ -16,7 +16,7 @@ working_distance_mm = [4.0, 6.0]
 [surfaces]
 occlusal = 0.9
 [cameras]
-most = 4
+max = 4
 """
 
 

@@ -148,7 +148,7 @@ def test_bad_input_of_repeat(tmp_path, capsys, phantom_file):
         (["--tooth", "46", "--jitter-mm", "-1"], "--jitter-mm"),
         (["--tooth", "46", "--supersampling", "0"], "--supersampling is 0"),
         (["--tooth", "46", "--seed", "-1"], "--seed is -1"),
-        (["--tooth", "46", "--scans", "3", "--study.farthest-mm", "0"], "--farthest-mm is 0"),
+        (["--tooth", "46", "--scans", "3", "--study.max-distance-mm", "0"], "--max-distance-mm is 0"),
     ):
         assert message in refused(capsys, "study", "repeat", phantom_file, *arguments, "--out", tmp_path / "out")
         assert not (tmp_path / "out").exists()

@@ -97,9 +97,9 @@ def test_it_stands_in_the_occlusal_frame(coarse_arch: Jaw) -> None:
 
 
 def test_the_twelve_cameras_can_scan_it_like_a_jaw(coarse_arch: Jaw) -> None:
-    options = ScanPathOptions(frames=50, minimum_overlap=0.4, jitter_mm=0.0, jitter_deg=0.0)
+    options = ScanPathOptions(frames=50, min_overlap=0.4, jitter_mm=0.0, jitter_deg=0.0)
     path = plan_scan_path(coarse_arch, twelve_cameras(), options, np.random.default_rng(0))
-    assert 0.5 < path.minimum_overlap < 1
+    assert 0.5 < path.min_overlap < 1
     tops = np.array([sphere.centre + [0, 0, sphere.radius_mm] for sphere in coarse_arch.spheres.values()])
     nearest = np.linalg.norm(tops[:, None] - path.curve.points[None], axis=2).min(axis=1)
     assert nearest.max() < 1.5
@@ -266,7 +266,7 @@ def test_a_sphere_that_the_scan_does_not_show_is_listed_with_the_reason(coarse_a
     # Of 34 one side is left, of 47 nothing.
     lost = (coarse_arch.face_labels == 47) | ((coarse_arch.face_labels == 34) & (centres[:, 0] > half[0] - 0.8))
     report = evaluate_spheres(
-        coarse_arch.mesh.submesh(~lost), coarse_arch, Rigid3.identity(), SphereOptions(least_points=50)
+        coarse_arch.mesh.submesh(~lost), coarse_arch, Rigid3.identity(), SphereOptions(min_points=50)
     )
     assert set(report.not_measured) == {"34", "47"}
     assert "points" in report.not_measured["47"]

@@ -392,7 +392,7 @@ def test_both_sides_of_a_thin_wall_stay_apart() -> None:
 def test_what_one_map_alone_saw_is_left_out() -> None:
     alone = fuse(depth_maps(HILLS, {"00000": POSES["00000"]}, names=("west",)), POSES)
     assert len(alone.faces) == 0
-    trusting = FusionOptions(least_maps=1)
+    trusting = FusionOptions(min_maps=1)
     assert len(fuse(depth_maps(HILLS, {"00000": POSES["00000"]}, names=("west",)), POSES, trusting).faces) > 1000
 
 

@@ -119,8 +119,8 @@ def test_faces_are_never_turned_over() -> None:
 def test_limits() -> None:
     mesh = roof(edge(1.0), 0.3)
     assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(enabled=False)) == (mesh, 0)
-    assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(most_outwards=0.01))[1] < 5
-    assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(least_angle_deg=120))[1] == 0
+    assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(max_outwards=0.01))[1] < 5
+    assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(min_angle_deg=120))[1] == 0
     assert sharpened(mesh, DETAIL_MM, SharpEdgeOptions(roundness=0))[1] == 0
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     assert sharpened(nothing, DETAIL_MM) == (nothing, 0)

@@ -91,11 +91,11 @@ def assessed(handpiece: Handpiece, section: Section, brief: DesignBrief | None =
 
 def test_a_brief_is_read_with_its_defaults(tmp_path: Path) -> None:
     path = tmp_path / "brief.toml"
-    path.write_text(SMALL + "[cameras]\nmost = 8\n[motion]\nturns = 3\n")
+    path.write_text(SMALL + "[cameras]\nmax = 8\n[motion]\nturns = 3\n")
     brief = read_brief(path)
     assert brief.sensor == PRESETS["thesis"]
     assert brief.working_distance_mm == (4.0, 6.0)
-    assert (brief.cameras.most, brief.motion.turns, brief.mouth.tooth) == (8, 3, 7)
+    assert (brief.cameras.max, brief.motion.turns, brief.mouth.tooth) == (8, 3, 7)
     near, far = brief.depth_range_mm
     assert 0 < near < 4.0 < 6.0 < far < 15.0
 
@@ -129,8 +129,8 @@ def test_a_sensor_may_be_changed_or_given_by_its_own_figures() -> None:
         ("[4.0, 6.0]", "[4.0, 20.0]", r"depth of field of thesis.*does not cover the working distance 4-20 mm"),
         ("[4.0, 6.0]", "[1.0, 6.0]", r"depth of field of thesis.*does not cover"),
         ("occlusal = 0.9", "occlusal = 90", r"share of surface 'occlusal' is 90"),
-        ("[surfaces]", "[cameras]\nmost = 1\n[surfaces]", r"cameras.most is 1"),
-        ("[surfaces]", "[cameras]\nmost = 2.5\n[surfaces]", r"cameras.most must be a whole number"),
+        ("[surfaces]", "[cameras]\nmax = 1\n[surfaces]", r"cameras.max is 1"),
+        ("[surfaces]", "[cameras]\nmax = 2.5\n[surfaces]", r"cameras.max must be a whole number"),
         ("[surfaces]", "[cameras]\nspacing_mm = 0.1\n[surfaces]", r"less than the width of the sensor"),
         ("[surfaces]", "[motion]\nturns = 2\n[surfaces]", r"motion.turns is 2"),
         ("[surfaces]", "[mouth]\ntooth = 9\n[surfaces]", r"mouth.tooth is 9"),

@@ -81,8 +81,8 @@ def test_groups_follow_from_what_is_asked_of_a_pair():
     rig = rig_of(a=shifted(0), b=shifted(2), c=shifted(4))
     assert stereo_pairs(rig, 5.0) == (("a", "b"), ("b", "c"))
     assert camera_groups(rig, 5.0) == (("a", "b", "c"),)
-    assert len(stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.2))) == 3
-    assert camera_groups(rig, 5.0, PairingOptions(minimum_overlap=0.9)) == (("a",), ("b",), ("c",))
+    assert len(stereo_pairs(rig, 5.0, PairingOptions(min_overlap=0.2))) == 3
+    assert camera_groups(rig, 5.0, PairingOptions(min_overlap=0.9)) == (("a",), ("b",), ("c",))
 
 
 def around(*degrees: float) -> dict[str, Rigid3]:
@@ -100,14 +100,14 @@ def test_the_largest_angle_of_a_pair_is_still_one(angle):
     names = rig.names
     assert rig.angle_deg(*names) == pytest.approx(angle)
     assert rig.meeting_deg(*names, 5.0) == pytest.approx(angle)
-    assert stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.0, maximum_angle_deg=angle)) == (names,)
-    assert stereo_pairs(rig, 5.0, PairingOptions(minimum_overlap=0.0, maximum_angle_deg=0.99 * angle)) == ()
+    assert stereo_pairs(rig, 5.0, PairingOptions(min_overlap=0.0, max_angle_deg=angle)) == (names,)
+    assert stereo_pairs(rig, 5.0, PairingOptions(min_overlap=0.0, max_angle_deg=0.99 * angle)) == ()
 
 
 @given(st.floats(5.0, 30.0), st.integers(5, 9))
 def test_a_ring_is_no_group_each_camera_has_its_neighbours(step, count):
     rig = rig_of(**around(*(step * k for k in range(count))))
-    ranked = rank_sources(rig, 5.0, PairingOptions(minimum_overlap=0.1))
+    ranked = rank_sources(rig, 5.0, PairingOptions(min_overlap=0.1))
     for k, name in enumerate(rig.names):
         neighbours = {rig.names[j] for j in (k - 1, k + 1) if 0 <= j < count}
         near = {other for other in ranked[name] if rig.angle_deg(name, other) < 2 * step - 0.01}
@@ -144,7 +144,7 @@ def test_no_angle_is_a_wall(angle):
     assert abs(at - beside) < 0.002
 
 
-@pytest.mark.parametrize("wrong", [{"minimum_overlap": 1.1}, {"maximum_angle_deg": -1.0}])
+@pytest.mark.parametrize("wrong", [{"min_overlap": 1.1}, {"max_angle_deg": -1.0}])
 def test_pairs_that_cannot_be_asked_for_are_refused(wrong):
     with pytest.raises(InputError, match="pairing: --"):
         PairingOptions(**wrong)

@@ -46,9 +46,7 @@ def test_a_sphere_is_seen_where_the_closed_form_says(distance_mm: float, inciden
     ball = sphere(radius)
     cam_from_world = Rigid3(np.eye(3), np.array([0, 0, distance_mm + radius]))
     seen = np.zeros(len(ball.faces), dtype=bool)
-    seen[
-        visible_faces(ball, CAMERA, cam_from_world, DEPTHS, VisibilityOptions(maximum_incidence_deg=incidence_deg))
-    ] = 1
+    seen[visible_faces(ball, CAMERA, cam_from_world, DEPTHS, VisibilityOptions(max_incidence_deg=incidence_deg))] = 1
     centres = cam_from_world.apply(ball.face_centres)
     sight = centres / np.linalg.norm(centres, axis=1, keepdims=True)
     facing = -np.sum(sight * ball.face_normals, axis=1) > np.cos(np.deg2rad(incidence_deg))
@@ -132,7 +130,7 @@ def seen_by_brute_force(mesh: Mesh, hand: Handpiece, pose: Rigid3, options: Visi
             seen[face, column] = (
                 hand.depth_range_mm[0] <= place[2] <= hand.depth_range_mm[1]
                 and mounted.camera.contains(mounted.camera.project(place[None]))[0]
-                and sight @ normal >= np.cos(np.deg2rad(options.maximum_incidence_deg))
+                and sight @ normal >= np.cos(np.deg2rad(options.max_incidence_deg))
                 and not crossing(mesh, eye, centre)
             )
     return seen
@@ -180,7 +178,7 @@ def over_the_molar(jaw: Jaw) -> list[Rigid3]:
 
 def test_each_law_of_sight_holds_on_a_jaw(coarse_phantom: Jaw) -> None:
     mesh, poses = coarse_phantom.mesh, over_the_molar(coarse_phantom)
-    found = survey_visibility(mesh, twelve_cameras(), poses, VisibilityOptions(maximum_incidence_deg=60.0))
+    found = survey_visibility(mesh, twelve_cameras(), poses, VisibilityOptions(max_incidence_deg=60.0))
     seen = found.images > 0
     assert 500 < seen.sum() < len(mesh.faces) / 4
     np.testing.assert_array_equal(found.most_at_once > 0, seen)
@@ -226,7 +224,7 @@ def test_a_working_distance_out_of_focus_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"cameras": 0}, "--cameras is 0"), ({"maximum_incidence_deg": 95.0}, "deg is 95")],
+    [({"cameras": 0}, "--cameras is 0"), ({"max_incidence_deg": 95.0}, "deg is 95")],
 )
 def test_options_that_see_nothing_or_backs_are_refused(change: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):

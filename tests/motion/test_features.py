@@ -188,7 +188,7 @@ def test_grey_pictures_are_read_once_as_far_as_memory_goes(capture: Capture, mon
     height, width = original(capture, *every[0]).shape[:2]
     greys, counts = [], []
     for room in (0, 2, 100):
-        pictures = Pictures(capture, most_bytes=room * height * width)
+        pictures = Pictures(capture, max_bytes=room * height * width)
         for image in every:
             pictures.image(*image)
         reads.clear()

@@ -296,10 +296,10 @@ def test_images_are_located(tmp_path: Path) -> None:
     capture = make_capture(tmp_path, rig, path)
     found = locate(capture, progress=lambda stage, done, total: stages.append(stage))
     plain = locate(capture, replace(MotionOptions(), least_squares=LeastSquaresOptions(enabled=False)))
-    for one, most_mm, most_px in ((found, 0.003, 0.1), (plain, 0.01, 0.5)):
+    for one, most_mm, max_px in ((found, 0.003, 0.1), (plain, 0.01, 0.5)):
         assert one.frames == tuple(path)
         assert 0 < np.abs(errors(one, path)[:, 3:]).max() < most_mm
-        assert 0 < one.reprojection_rms_px < most_px
+        assert 0 < one.reprojection_rms_px < max_px
     assert list(dict.fromkeys(stages)) == ["features", "triangulation", "matching", "patches"]
     assert {"features_s", "odometry_s", "adjustment_s", "observations"} <= set(found.log)
 

@@ -277,7 +277,7 @@ def test_frames_hold_together_where_enough_points_are_seen_on_both_sides(lost: t
 
 def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
     model, pictures = over_a_wall()
-    options = replace(PatchOptions(), minimum_views=9)
+    options = replace(PatchOptions(), min_views=9)
     longer = lengthen(model, lambda name: pictures[name], options).tracks
     assert len(longer.points) == len(model.tracks.points)
 

@@ -183,7 +183,7 @@ def test_names_do_not_matter(model, tmp_path):
 def test_twice_the_size_has_twice_the_focal_length(model, tmp_path):
     for name, image in scene().images.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC))
-    options = PhotographOptions(largest_px=720)
+    options = PhotographOptions(max_image_px=720)
     larger = locate_photographs(read_photographs(tmp_path, tmp_path), options).cameras["camera"]
     assert (larger.width, larger.height) == (2 * WIDE.width, 2 * WIDE.height)
     assert 0 < abs(larger.focal_px[0] / (2 * model.cameras["camera"].focal_px[0]) - 1) < 0.01

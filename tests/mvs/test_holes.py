@@ -170,7 +170,7 @@ def matched(
     stage.measure_depth_across(
         *(capture, found, maps, folder / "across", AcrossOptions(left_share=left_share), StereoOptions()),
         agreement_mm=0.08,
-        least_maps=2,
+        min_maps=2,
         holes=holes,
     )
     return asked

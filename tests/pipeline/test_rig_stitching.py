@@ -82,7 +82,7 @@ def test_laid_over_the_surface_points_hold_the_path_nearer_to_the_truth(
         return float(np.median(left_over(np.array([pose.inverse().translation for pose in poses]), true)))
 
     options = StitchOptions()
-    never = replace(options.rig_patches, minimum_views=1000)
+    never = replace(options.rig_patches, min_views=1000)
     before = stitch_rig(film[0], replace(options, rig_patches=never))
     assert before.motion is not None
     assert any("on the surface" in note for note in before.panorama.notes)
@@ -114,7 +114,7 @@ def test_over_the_true_surface_the_path_is_right_and_what_agrees_on_no_poses_cha
     assert better is not None
     assert better.rig.names == found.rig.names
     assert 0.001 < worst_mm(better) < 0.04
-    assert refined(AdjustmentOptions(minimum_angle_deg=89.0)) is None
+    assert refined(AdjustmentOptions(min_angle_deg=89.0)) is None
 
 
 def test_pixels_show_what_lies_there_in_true_millimetres(pano: Path, film: tuple[Capture, GroundTruth]) -> None:

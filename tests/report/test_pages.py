@@ -301,7 +301,7 @@ def test_deviations_have_the_colours_of_their_picture():
 
 
 def test_a_large_surface_is_simplified_and_the_page_says_so(scan_folder):
-    page = report_page(storage.read_result(scan_folder), ReportOptions(most_faces=500, most_reference_faces=2000))
+    page = report_page(storage.read_result(scan_folder), ReportOptions(max_faces=500, max_reference_faces=2000))
     full = len(storage.read_mesh(scan_folder / "deviation.ply").faces)
     assert f"of its {full:,}".replace(",", "\u202f") + " faces" in page
     layers = scene_of(page)["layers"]
@@ -366,7 +366,7 @@ def test_a_folder_with_nothing_to_report(tmp_path, capsys, scan_folder):
     for broken in ("[]", '{"reconstruct": 3}'):
         (tmp_path / "killed" / "run.json").write_text(broken)
         assert "run.json: not written by cuspid" in refused(capsys, "report", tmp_path / "killed")
-    assert "--most-faces" in refused(capsys, "report", scan_folder, "--most-faces", 3)
+    assert "--max-faces" in refused(capsys, "report", scan_folder, "--max-faces", 3)
     assert not list(tmp_path.glob("**/report.html"))
 
 

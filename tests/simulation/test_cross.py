@@ -112,8 +112,8 @@ def test_the_frames_of_the_sweep_are_the_last_and_overlap(upper: Jaw, path: Scan
     names = list(path.rig_from_world)
     assert 10 < len(path.cross_sweep) < len(names) / 2
     assert list(path.cross_sweep) == names[-len(path.cross_sweep) :]
-    assert path.minimum_overlap >= 0.75
-    write_path(tmp_path / "path.json", path.minimum_overlap, path.mean_overlap, path.seen, path.cross_sweep)
+    assert path.min_overlap >= 0.75
+    write_path(tmp_path / "path.json", path.min_overlap, path.mean_overlap, path.seen, path.cross_sweep)
     assert json.loads((tmp_path / "path.json").read_text())["cross_sweep_frames"] == list(path.cross_sweep)
     room = Room(upper.mesh, HANDPIECE.solid, 0.5)
     assert min(room.clearance(pose)[0] for pose in path.rig_from_world.values()) >= 0.5

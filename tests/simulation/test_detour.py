@@ -101,7 +101,7 @@ def test_the_room_for_a_pose_is_its_clearance(coarse_phantom: Jaw) -> None:
 def test_a_hand_that_trembles_between_the_stations_is_not_refused(coarse_phantom: Jaw) -> None:
     """Of the frames of this one, one would come too near, although it fits half a millimetre before and after it."""
     options = ScanPathOptions(
-        tooth=46, clearance_mm=4.3, jitter_mm=1.0, jitter_deg=10.0, jitter_length_mm=1.0, minimum_overlap=0.3
+        tooth=46, clearance_mm=4.3, jitter_mm=1.0, jitter_deg=10.0, jitter_length_mm=1.0, min_overlap=0.3
     )
     four = essential_four()
     path = plan_scan_path(coarse_phantom, four, options, np.random.default_rng(1))

@@ -246,7 +246,7 @@ def test_a_path_with_further_passes_overlaps_and_fits(coarse_phantom: Jaw) -> No
     path = plan_scan_path(coarse_phantom, HANDPIECE, options, np.random.default_rng(0))
     room = Room(coarse_phantom.mesh, HANDPIECE.solid, 0.5)
     assert min(room.clearance(pose)[0] for pose in path.rig_from_world.values()) >= 0.5
-    assert path.minimum_overlap > 0.7
+    assert path.min_overlap > 0.7
     assert path.seen[31] >= alone.seen[31] - 0.01
 
 

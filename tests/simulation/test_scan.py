@@ -104,7 +104,7 @@ def test_a_mesh_without_crowns_is_refused() -> None:
 
 def test_a_tooth_is_scanned_with_the_images_of_the_thesis(molar_path: ScanPath) -> None:
     assert list(molar_path.rig_from_world) == [f"{k:05d}" for k in range(10)]
-    assert 0.75 < molar_path.minimum_overlap <= molar_path.mean_overlap < 0.99
+    assert 0.75 < molar_path.min_overlap <= molar_path.mean_overlap < 0.99
 
 
 def test_cameras_look_at_the_tooth_from_about_the_working_distance(coarse_phantom: Jaw, molar_path: ScanPath) -> None:
@@ -146,9 +146,9 @@ def test_too_few_frames_are_refused_and_more_are_taken_where_none_is_asked(coars
         InputError, match=r"with 4 frames, consecutive images overlap by only \d\d%, less than 75%; raise"
     ):
         plan(coarse_phantom, ScanPathOptions(tooth=46, frames=4), few)
-    dense = plan(coarse_phantom, ScanPathOptions(tooth=46, minimum_overlap=0.87), few)
+    dense = plan(coarse_phantom, ScanPathOptions(tooth=46, min_overlap=0.87), few)
     assert len(dense.rig_from_world) > 10
-    assert dense.minimum_overlap > 0.87
+    assert dense.min_overlap > 0.87
 
 
 def test_unknown_teeth_are_refused(coarse_phantom: Jaw) -> None:
@@ -289,7 +289,7 @@ def test_three_turns_look_from_the_cheek_down_and_from_the_tongue(curve: ArchCur
 
 
 def test_the_passes_go_there_and_back_and_overlap_at_the_turns_too(turned_path: ScanPath) -> None:
-    assert 0.75 < turned_path.minimum_overlap < 0.95
+    assert 0.75 < turned_path.min_overlap < 0.95
     assert len(turned_path.overlap) == len(turned_path.rig_from_world) - 1
     places = np.array([pose.inverse().translation for pose in turned_path.rig_from_world.values()])
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 2.5, "no jump from the end of a pass to the next"
@@ -348,7 +348,7 @@ def test_the_hand_drifts_on_turns_too(coarse_phantom: Jaw) -> None:
     [
         *({"frames": frames} for frames in (1, 0, -3)),
         *({"length_mm": length} for length in (0.0, -1.0, np.nan)),
-        *({"minimum_overlap": share} for share in (1.0, -0.1, np.nan)),
+        *({"min_overlap": share} for share in (1.0, -0.1, np.nan)),
         *({name: -0.1} for name in ("jitter_mm", "jitter_deg", "clearance_mm")),
         *({"jitter_length_mm": length} for length in (0.0, np.nan)),
     ],

@@ -255,19 +255,19 @@ def test_distortion_is_taken_out(scene: Scene, surface: HeightMap) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("most_bytes", [0, 6 * 240 * 180 * 3])
+@pytest.mark.parametrize("max_bytes", [0, 6 * 240 * 180 * 3])
 def test_how_many_images_fit_in_memory_does_not_change_the_surface(
-    scene: Scene, surface: HeightMap, monkeypatch: pytest.MonkeyPatch, most_bytes: int
+    scene: Scene, surface: HeightMap, monkeypatch: pytest.MonkeyPatch, max_bytes: int
 ) -> None:
     read = list[str]()
-    monkeypatch.setattr("cuspid.stitching.plane_sweep._BYTES", most_bytes)
+    monkeypatch.setattr("cuspid.stitching.plane_sweep._BYTES", max_bytes)
     monkeypatch.setattr(Scene, "read", lambda self, name: read.append(name) or self.images[name])
     found = scene.swept()
     assert found is not None
     assert np.array_equal(found.heights, surface.heights)
     assert np.array_equal(found.known, surface.known)
     times = np.unique(read, return_counts=True)[1]
-    assert np.sum(times == 1) == most_bytes // (240 * 180 * 3)
+    assert np.sum(times == 1) == max_bytes // (240 * 180 * 3)
     assert times.max() == 3, "once a round"
 
 

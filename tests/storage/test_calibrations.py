@@ -601,7 +601,7 @@ def rig_of(count: int, model: str = "OPENCV") -> Rig:
 @pytest.mark.parametrize("model", LENSES)
 @pytest.mark.parametrize("kind", [name for name, each in FORMATS.items() if each.write is not None])
 def test_what_is_written_is_read_again(tmp_path: Path, kind: str, model: str) -> None:
-    rig = rig_of(min(3, FORMATS[kind].most_cameras or 3), model)
+    rig = rig_of(min(3, FORMATS[kind].max_cameras or 3), model)
     carried = carried_over(rig, kind)
     path = tmp_path / f"it{SUFFIXES.get(kind, '.json')}"
     write_calibration(path, carried.rig, kind)
@@ -638,10 +638,10 @@ def test_a_lens_that_cannot_be_carried_over_is_refused(tmp_path: Path, capsys: p
     write_calibration(tmp_path / "a.yml", Rig({"a": MountedCamera(camera, Rigid3.identity())}), "opencv")
     line = refused(capsys, "rig", "convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab")
     assert "px off over the image" in line
-    assert "--most-px" in line
+    assert "--max-px" in line
 
     assert not (tmp_path / "m.json").exists()
-    run("rig", "convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab", "--most-px", "2000")
+    run("rig", "convert", tmp_path / "a.yml", tmp_path / "m.json", "--to", "matlab", "--max-px", "2000")
     assert (tmp_path / "m.json").exists()
 
 

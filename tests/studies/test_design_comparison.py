@@ -188,7 +188,7 @@ def test_turns_are_enough_where_completeness_stops_to_grow():
         {"designs": ()},
         {"seeds": (1, 1)},
         {"frame_rate_hz": 0.0},
-        {"minimum_openness": 1.0},
+        {"min_openness": 1.0},
         {"image_scale": 0.0},
     ],
 )

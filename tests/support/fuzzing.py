@@ -742,7 +742,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         _arch, verb("jaw", "prepare", "@jaw.ply", "--tooth", str(TOOTH), "--out", f"@{_OUT}.ply", "crack")
     ),
     "box": Scenario(_arch, verb("jaw", "box", "@jaw.ply", "--out", f"@{_OUT}.ply")),
-    "mean shape": Scenario(_population, verb("jaw", "shape", "@jaws", "--most-rounds", "1", "--out", f"@{_OUT}")),
+    "mean shape": Scenario(_population, verb("jaw", "shape", "@jaws", "--max-rounds", "1", "--out", f"@{_OUT}")),
     "visibility": Scenario(_probe, verb("rig", "visibility", "@jaw.ply", *PROBE, *SCAN[:4], "--out", f"@{_OUT}")),
     "photograph": Scenario(_four_cameras, verb("rig", "photograph", "@handpiece.json", *BOARD, "--out", f"@{_OUT}")),
     "film": Scenario(_filmed, verb("pano", "film", "@jaw.ply", *FILM, "--out", f"@{_OUT}")),

@@ -39,7 +39,7 @@ from cuspid.studies.design_comparison import (
 from cuspid.studies.grid import Outcome, check_workers
 from cuspid.studies.trial import TrialOptions
 
-CASE_OPTIONS = ("edge_mm", "image_scale", "minimum_openness", "samples", "thickness_mm")
+CASE_OPTIONS = ("edge_mm", "image_scale", "min_openness", "samples", "thickness_mm")
 """Options that a scan depends on: if they change, its results cannot be kept."""
 
 

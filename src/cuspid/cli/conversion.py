@@ -33,7 +33,7 @@ def convert(
     unit: storage.Unit | None = None,
     image_size: Annotated[tuple[int, int] | None, arg(metavar="W H"), Range(1, MOST_PX)] = None,
     working_distance_mm: Annotated[float | None, Range(0.1, 100_000)] = None,
-    most_px: Annotated[float, Range(0, 1e9)] = MOST_LOST_PX,
+    max_px: Annotated[float, Range(0, 1e9)] = MOST_LOST_PX,
 ) -> None:
     """Convert the calibration of a camera, a stereo pair or several cameras between cuspid and other programs.
 
@@ -47,26 +47,26 @@ def convert(
         unit: Unit of the lengths that are read, where the file does not tell it.
         image_size: Width and height of the images, px, where the file does not tell them.
         working_distance_mm: Distance from the cameras to the surface, for a handpiece.json (guessed unless given).
-        most_px: A lens that the other format does not have is replaced by the nearest that it has; more than this
+        max_px: A lens that the other format does not have is replaced by the nearest that it has; more than this
             difference in the image is refused.
     """
     kind = to or format_of_name(target)
     if target.resolve() == source.resolve():
         raise InputError(f"convert: {target}: is the file that is read; give another name for the result")
     read = read_calibration(source, kind=from_, unit=unit, image_size_px=image_size)
-    _tell(source, read.losses, read.notes, most_px)
+    _tell(source, read.losses, read.notes, max_px)
     carried = carried_over(read.rig, kind)
-    _tell(target, carried.losses, carried.notes, most_px)
+    _tell(target, carried.losses, carried.notes, max_px)
     write_calibration(target, carried.rig, kind, working_distance_mm)
     names = list(read.rig.names)
     said = f"{target}: {kind}, {len(names)} camera(s) ({named(names)}), from {read.format}"
     console.print(said, soft_wrap=True, highlight=False)
 
 
-def _tell(path: Path, losses: Mapping[str, Loss], notes: tuple[str, ...], most_px: float) -> None:
+def _tell(path: Path, losses: Mapping[str, Loss], notes: tuple[str, ...], max_px: float) -> None:
     """Say what is lost. Raises InputError where that is too much."""
     for name, loss in losses.items():
-        if loss.largest_px > most_px:
-            raise InputError(f"{path}: camera {name}: {loss}; --most-px {most_px:g} allows less")
+        if loss.largest_px > max_px:
+            raise InputError(f"{path}: camera {name}: {loss}; --max-px {max_px:g} allows less")
     for note in (*(f"camera {name}: {loss}" for name, loss in losses.items()), *notes):
         console.print(f"note: {path}: {note}", soft_wrap=True, highlight=False)

@@ -180,7 +180,7 @@ def _print_model(model: ShapeModel) -> None:
     for number, step in enumerate(model.log, start=1):
         console.print(f"round {number}: the mean's surface moved {step.surface_change_um:.1f} µm")
     if not model.converged:
-        console.print("note: the mean has not converged; increase --most-rounds or --tolerance-um")
+        console.print("note: the mean has not converged; increase --max-rounds or --tolerance-um")
     table = Table(title=f"{'Shape' if model.scaled else 'Shape and size'}: modes", title_justify="left")
     for column in ("mode", "SD, mm", "share of variance, %"):
         table.add_column(column, justify="right")

@@ -22,8 +22,8 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 RARE = re.compile(
     "manufacturing_.*|jitter_.*|led_.*|gamma.*|step_.*|label_map|labels|jaw_seed|supersampling|renderer"
     "|aperture_mm|smear_mm|readout|scattering|saliva|crosstalk|bayer|jpeg_quality"
-    "|clearance_mm|minimum_overlap|turn_deg|cross_sweep|own_images|left_share"
-    "|farthest_mm|pair_samples|retry_failed|new_texture|cluster"
+    "|clearance_mm|min_overlap|turn_deg|cross_sweep|own_images|left_share"
+    "|max_distance_mm|pair_samples|retry_failed|new_texture|cluster"
     "|side_.*|outer_.*|ring_mm|seat_.*|wall_mm|web_mm|shoulder_mm|duct_mm|arm_.*|neck_.*|grip_.*|handle_.*"
     "|views|views_of_.*|min_tilt_deg|distance_ratio|shared_instants|move_share|settle_s|pixels|port|host|inverted"
     "|terraces|clear_px|outlier_sigmas|rounds|border_bits|circle_share|marker_share|spacing_share|legacy|patches"

@@ -46,9 +46,9 @@ class MarginOptions(Options):
     """The straight flanks begin at this distance from the edge, measured along the section."""
     flank_to_mm: Annotated[float, Range(0, 10)] = 0.3
     """The flanks end at this distance from the edge."""
-    least_bend_deg: Annotated[float, Range(0, 180)] = 25.0
+    min_bend_deg: Annotated[float, Range(0, 180)] = 25.0
     """Minimum angle between the directions of the flanks."""
-    most_floor_um: Annotated[float, Range(0.001, 10_000)] = 20.0
+    max_floor_um: Annotated[float, Range(0.001, 10_000)] = 20.0
     """A section is evaluated only if the edge of the reference itself is found within this distance of the line."""
 
     def __post_init__(self) -> None:
@@ -150,7 +150,7 @@ def _section(
     axes = _axes(tangent)
     own = reference.section(point, tangent, axes, options)
     true = _edge(own, options)
-    if own is None or true is None or 1000 * np.linalg.norm(true.point) > options.most_floor_um:
+    if own is None or true is None or 1000 * np.linalg.norm(true.point) > options.max_floor_um:
         return None
     found = scan.section(point, tangent, axes, options)
     edge = _edge(found, options)
@@ -314,7 +314,7 @@ def _corner(points: Float[np.ndarray, "m 2"], at: int, arm: int, options: Margin
     gap = int(options.flank_from_mm / _FINE_MM)
     (p, u), (q, v) = _line(points[at - arm : at - gap + 1]), _line(points[at + gap : at + arm + 1])
     sine = u[0] * v[1] - u[1] * v[0]
-    if -np.rad2deg(np.arctan2(sine, u @ v)) < options.least_bend_deg:
+    if -np.rad2deg(np.arctan2(sine, u @ v)) < options.min_bend_deg:
         return None
     meeting = p + u * ((q - p)[0] * v[1] - (q - p)[1] * v[0]) / sine
     near = points[at - arm : at + arm + 1]

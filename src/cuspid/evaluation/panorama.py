@@ -58,13 +58,13 @@ class PanoramaEvaluationOptions(Options):
     """Maximum number of pixels of the panorama that are traced to the true jaw, evenly distributed."""
     complete_pct: Annotated[float, Range(0, 100)] = 90.0
     """The arch is complete if, of each tooth, this share of what the frames saw is shown."""
-    fewest_frames_pct: Annotated[float, Range(0, 100)] = 10.0
+    min_frames_pct: Annotated[float, Range(0, 100)] = 10.0
     """A panorama of a smaller share of the frames counts as failed."""
-    largest_scale: Annotated[float, Range(1.01, 100)] = 2.0
+    max_scale: Annotated[float, Range(1.01, 100)] = 2.0
     """A panorama whose scale is wrong by more than this factor counts as failed."""
-    coarsest_mm: Annotated[float, Range(0.001, 10)] = 0.5
+    max_pixel_mm: Annotated[float, Range(0.001, 10)] = 0.5
     """A panorama whose pixels are larger than this counts as collapsed."""
-    worst_median_mm: Annotated[float, Range(0.01, 100)] = 5.0
+    max_median_mm: Annotated[float, Range(0.01, 100)] = 5.0
     """A panorama whose median error is larger than this does not show an arch."""
 
 
@@ -506,18 +506,18 @@ class _Comparison:
 
     def _too_few_frames(self) -> str | None:
         used, frames = sum(frame.used for frame in self.panorama.frames), len(self.panorama.frames)
-        if frames and 100 * used < self.options.fewest_frames_pct * frames:
+        if frames and 100 * used < self.options.min_frames_pct * frames:
             return f"only {used} of {frames} frames are placed"
         return None
 
     def _collapse_reason(self, scale: float, median_mm: float) -> str | None:
-        if median_mm > self.options.worst_median_mm:
+        if median_mm > self.options.max_median_mm:
             return f"no arch: half of its tooth pixels lie more than {median_mm:.1f} mm from where they should"
-        most = self.options.largest_scale
+        most = self.options.max_scale
         if self.panorama.mm_per_px is not None and not 1 / most < scale < most:
             return f"its millimetres are {scale:.3g} true ones"
         coarse = scale * (self.panorama.mm_per_px or 1.0)
-        if coarse > self.options.coarsest_mm:
+        if coarse > self.options.max_pixel_mm:
             return f"collapsed: one pixel for {coarse:.2g} mm of the teeth"
         extent = coarse * max(self.panorama.covered.shape)
         if extent < _LEAST_EXTENT_MM:

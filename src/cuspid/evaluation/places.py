@@ -50,12 +50,12 @@ def scatter(mesh: Mesh, count: int, rng: np.random.Generator) -> Places:
     return Places(points=points, normals=mesh.face_normals[faces], faces=faces)
 
 
-def deviations_um(places: Places, scan: SignedDistance, farthest_mm: float) -> Float[np.ndarray, "n"]:
+def deviations_um(places: Places, scan: SignedDistance, max_distance_mm: float) -> Float[np.ndarray, "n"]:
     """How far a scan lies outside each place; NaN where it does not show it."""
     closest = scan.closest_points(places.points)
     signed_mm = -closest.signed_mm
     same_side = np.sum(scan.mesh.face_normals[closest.faces] * places.normals, axis=1) > 0
-    shown = ~closest.on_border & (np.abs(signed_mm) <= farthest_mm) & same_side
+    shown = ~closest.on_border & (np.abs(signed_mm) <= max_distance_mm) & same_side
     return np.where(shown, 1000 * signed_mm, np.nan)
 
 

@@ -44,7 +44,7 @@ class PairOptions(Options):
     """How they are aligned."""
     samples: Annotated[int, Range(100, 20_000_000)] = 100_000
     """Sample points on each surface, uniform by area."""
-    farthest_mm: Annotated[float, Range(0.0001, 1000)] = 0.5
+    max_distance_mm: Annotated[float, Range(0.0001, 1000)] = 0.5
     """A point farther than this from the other scan counts as surface that the other one does not show."""
 
 
@@ -82,4 +82,4 @@ def _signed_distances(
 ) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Signed distances of points of a scan from a surface, and which of them the surface has, too."""
     closest = surface.closest_points(scan.sample(options.samples, rng)[0])
-    return closest.signed_mm, ~closest.on_border & (np.abs(closest.signed_mm) <= options.farthest_mm)
+    return closest.signed_mm, ~closest.on_border & (np.abs(closest.signed_mm) <= options.max_distance_mm)

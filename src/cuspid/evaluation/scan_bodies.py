@@ -34,11 +34,11 @@ _COVERED_MM = 0.15
 class BodyOptions(Options):
     """When a scan body counts as found."""
 
-    least_points: Annotated[int, Range(10, 1_000_000)] = 200
+    min_points: Annotated[int, Range(10, 1_000_000)] = 200
     """Samples of the scan on the body, at least."""
-    most_rms_um: Annotated[float, Range(0.1, 10_000)] = 120.0
+    max_rms_um: Annotated[float, Range(0.1, 10_000)] = 120.0
     """Root mean square distance of these from it, at most."""
-    least_coverage_pct: Annotated[float, Range(0, 100)] = 15.0
+    min_coverage_pct: Annotated[float, Range(0, 100)] = 15.0
     """Share of the whole surface of the body, its hidden bottom included, that must be found."""
 
 
@@ -67,14 +67,14 @@ def fit_body(
     that its axis roughly has. Raises InputError where the scan shows none there.
     """
     points = _nearby(scan, library.mesh, centre)
-    if len(points) < options.least_points:
-        raise InputError(f"only {len(points)} points of the scan lie there; at least {options.least_points} are needed")
+    if len(points) < options.min_points:
+        raise InputError(f"only {len(points)} points of the scan lie there; at least {options.min_points} are needed")
     start = _best_start(points, library, centre, up)
     body_from_scan = start
     for reach_mm in _NARROWER_MM:
         near = points[np.abs(library.closest_points(body_from_scan.apply(points)).signed_mm) < reach_mm]
-        if len(near) < options.least_points:
-            raise InputError(f"only {len(near)} points of the scan lie on the body; {options.least_points} are needed")
+        if len(near) < options.min_points:
+            raise InputError(f"only {len(near)} points of the scan lie on the body; {options.min_points} are needed")
         body_from_scan = refine(near, library, body_from_scan, RegistrationOptions())
     return _checked(scan, library, body_from_scan, near, options)
 
@@ -135,7 +135,7 @@ def _checked(
     scan_from_body = body_from_scan.inverse()
     places, _ = library.mesh.sample(2000, np.random.default_rng(0))
     coverage = 100 * float(np.mean(scan.closest(scan_from_body.apply(places))[0] < _COVERED_MM))
-    if rms_um > options.most_rms_um or coverage < options.least_coverage_pct:
+    if rms_um > options.max_rms_um or coverage < options.min_coverage_pct:
         raise InputError(
             f"what the scan shows there is no such body ({rms_um:.0f} um RMS, {coverage:.0f} % of it found); check the "
             "place and the library file"

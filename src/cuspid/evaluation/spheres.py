@@ -60,9 +60,9 @@ class SphereOptions(Options):
     """Points within this angle of the occlusal direction belong to it; the rest is too near to the base."""
     outlier_sigmas: Annotated[float, Range(0.01, 1000)] = 5.0
     """Points farther than this from the fitted sphere, in robust standard deviations, are left out of the fit."""
-    least_points: Annotated[int, Range(4, 10_000_000)] = 200
+    min_points: Annotated[int, Range(4, 10_000_000)] = 200
     """A sphere with fewer points is not measured."""
-    least_coverage_pct: Annotated[float, Range(0, 100)] = 50.0
+    min_coverage_pct: Annotated[float, Range(0, 100)] = 50.0
     """A sphere is not measured if its points cover less than this of the cap within ``polar_deg``."""
 
 
@@ -262,8 +262,8 @@ def _measure(
     for round_ in range(_ROUNDS):
         chosen &= round_ >= _FREE_ROUNDS
         chosen |= _belongs(points, centre, nominal.radius_mm, occlusal, options)
-        if chosen.sum() < options.least_points:
-            return f"only {chosen.sum()} points; at least {options.least_points} are needed"
+        if chosen.sum() < options.min_points:
+            return f"only {chosen.sum()} points; at least {options.min_points} are needed"
         fit = _fit(points[chosen], weights[chosen], options.outlier_sigmas)
         moved = np.linalg.norm(fit.centre - centre)
         centre = fit.centre
@@ -274,8 +274,8 @@ def _measure(
     if abs(fit.radius - nominal.radius_mm) > options.band_mm:
         return f"the fitted radius is {fit.radius:.2f} mm, nominal {nominal.radius_mm:g} mm"
     coverage = _coverage_pct(points[chosen] - centre, occlusal, options.polar_deg)
-    if coverage < options.least_coverage_pct:
-        return f"only {coverage:.0f} % of its cap has points; at least {options.least_coverage_pct:g} % is needed"
+    if coverage < options.min_coverage_pct:
+        return f"only {coverage:.0f} % of its cap has points; at least {options.min_coverage_pct:g} % is needed"
     return _measurement(fit, weights[chosen], nominal, coverage)
 
 

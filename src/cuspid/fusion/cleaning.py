@@ -23,9 +23,9 @@ class CleaningOptions(Options):
     """Cleaning of a fused mesh. Lengths are given in details: what the images resolve of the surface (12 um for the
     built-in handpieces), about a pixel."""
 
-    least_piece_width: Annotated[float, Range(0, 100_000)] = 40.0
+    min_piece_width: Annotated[float, Range(0, 100_000)] = 40.0
     """Connected pieces with less area than a square of this side, in details (0.2 mm2 at 12 um), are removed."""
-    least_piece_share: Annotated[float, Range(0, 1)] = 0.005
+    min_piece_share: Annotated[float, Range(0, 1)] = 0.005
     """Connected pieces with less than this share of the total area are removed."""
     spared_piece_share: Annotated[float, Range(0, 1)] = 0.05
     """Connected pieces with at least this share of the area of the largest one are kept, however small."""
@@ -185,7 +185,7 @@ def _floating(
     """Faces of pieces that are small in details or beside the total, and beside the largest one; and the number of such
     pieces."""
     area = np.bincount(pieces, areas)
-    least_mm2 = max((options.least_piece_width * detail_mm) ** 2, options.least_piece_share * area.sum())
+    least_mm2 = max((options.min_piece_width * detail_mm) ** 2, options.min_piece_share * area.sum())
     small = (area < least_mm2) & (area < options.spared_piece_share * area.max(initial=0.0))
     return small[pieces], int(small.sum())
 

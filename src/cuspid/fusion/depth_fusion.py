@@ -53,16 +53,16 @@ class FusionOptions(Options):
     handpiece shows, 0.05 mm for the built-in ones."""
     truncation_voxels: Annotated[float, Range(1, 100)] = 3.0
     """Distance from a surface, in voxels, up to which depth maps are blended."""
-    largest_jump: Annotated[float, Range(0.01, 10_000)] = 12.5
+    max_jump: Annotated[float, Range(0.01, 10_000)] = 12.5
     """Neighbouring depths that differ by more than this many times the detail (0.15 mm at 12 um) do not belong to the
     same surface."""
-    least_weight: Annotated[float | None, Range(0, 1_000_000)] = None
+    min_weight: Annotated[float | None, Range(0, 1_000_000)] = None
     """Minimum weight (sum of confidences) for a voxel to count as observed. Default: 0.001 for each frame, at most
     0.01: what many frames see is seen well by some of them."""
     agreement: Annotated[float, Range(0.01, 10_000)] = 6.65
     """A depth map confirms a vertex within this many times the detail (0.08 mm at 12 um); nearer ones have more
     weight."""
-    least_maps: Annotated[int, Range(1, 10_000)] = 2
+    min_maps: Annotated[int, Range(1, 10_000)] = 2
     """Number of depth maps that must confirm a vertex."""
     finer_bends: bool | None = None
     """Vertices at half the spacing where the surface bends by more than 20 degrees from vertex to vertex, as at edges.
@@ -74,7 +74,7 @@ class FusionOptions(Options):
 
     def least_weight_for(self, frames: int) -> float:
         """Minimum weight of a voxel where there are so many frames."""
-        return min(0.001 * frames, 0.01) if self.least_weight is None else self.least_weight
+        return min(0.001 * frames, 0.01) if self.min_weight is None else self.min_weight
 
     def resolved(self, detail_mm: float, footprint_mm: float) -> FusionOptions:
         """With the grid for a handpiece whose pixels have a footprint that may be less than the detail.
@@ -107,7 +107,7 @@ def fuse(
     after the first pass. The maps of a frame must be consecutive. The same maps in the same order give the same mesh.
     """
     options = options or FusionOptions()
-    return _votes(depth_maps, rig_from_world, detail_mm, options, "fusion", progress).outcome(options.least_maps)
+    return _votes(depth_maps, rig_from_world, detail_mm, options, "fusion", progress).outcome(options.min_maps)
 
 
 def find_holes(
@@ -123,7 +123,7 @@ def find_holes(
     options = options or FusionOptions()
     coarse = replace(options, voxel_mm=2 * options.voxel_for(detail_mm), finer_bends=False)
     votes = _votes(depth_maps, rig_from_world, detail_mm, coarse, "holes", progress)
-    mesh = votes.outcome(options.least_maps).mesh
+    mesh = votes.outcome(options.min_maps).mesh
     rims = hole_rims(mesh)
     return SurfacePoints(mesh.vertices[rims], mesh.vertex_normals[rims])
 
@@ -138,7 +138,7 @@ def _votes(
 ) -> Votes:
     """What the depth maps say about the rough mesh that they blend to."""
     voxel_mm = options.voxel_for(detail_mm)
-    jump_mm, agreement_mm = options.largest_jump * detail_mm, options.agreement * detail_mm
+    jump_mm, agreement_mm = options.max_jump * detail_mm, options.agreement * detail_mm
     volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
     half = len(rig_from_world)
 
@@ -309,12 +309,12 @@ class Votes:
         inward /= np.linalg.norm(inward, axis=1, keepdims=True)
         return np.flatnonzero((centres @ inward.T > -radii[:, None]).all(axis=1))
 
-    def outcome(self, least_maps: int) -> Fused:
+    def outcome(self, min_maps: int) -> Fused:
         """The mesh with its vertices at the mean of the depth maps, coloured, without what too few maps confirm."""
         total = np.maximum(self.moment[:, :1], 1e-12)
         vertices = self.rough.vertices + self.rough.vertex_normals * self.moment[:, 1:2] / total
         colors: UInt8[np.ndarray, "v 3"] = np.rint(self.color / total).clip(0, 255).astype(np.uint8)
-        confirmed = (self.maps >= least_maps) & self.measured
+        confirmed = (self.maps >= min_maps) & self.measured
         kept = confirmed[self.rough.faces].all(axis=1)
         used = used_vertices(self.rough.faces[kept], len(self.rough.vertices))
         return Fused(Mesh(vertices, self.rough.faces, colors).submesh(kept), self._sigma_mm()[used])

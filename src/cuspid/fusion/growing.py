@@ -35,7 +35,7 @@ class GrowingSurface:
         options = options or FusionOptions()
         voxel_mm = options.voxel_for(detail_mm)
         self._volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
-        self._jump_mm, self._least_weight = options.largest_jump * detail_mm, options.least_weight_for(_MANY)
+        self._jump_mm, self._least_weight = options.max_jump * detail_mm, options.least_weight_for(_MANY)
         self._colors = np.zeros((0, BLOCK**3, 4), dtype=np.float32)
         self._changed = set[int]()
 

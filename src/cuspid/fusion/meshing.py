@@ -37,12 +37,12 @@ def _place(neighbours, slot, i, j, k):
 
 @kernel
 @no_type_check
-def _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
+def _corners(distance, weight, neighbours, slot, i, j, k, min_weight, values):
     """Distances at the eight corners of a cell; False where one is unobserved or the surface does not cross."""
     inside = 0
     for corner in range(8):
         other, index = _place(neighbours, slot, i + (corner >> 2), j + ((corner >> 1) & 1), k + (corner & 1))
-        if other < 0 or weight[other, index] < least_weight:
+        if other < 0 or weight[other, index] < min_weight:
             return False
         values[corner] = distance[other, index]
         inside += values[corner] < 0
@@ -73,14 +73,14 @@ def _cell_vertex(values, vertex):
 
 @kernel
 @no_type_check
-def _vertices(distance, weight, neighbours, origins, least_weight, index_of_cell, first, last, row, vertices):
+def _vertices(distance, weight, neighbours, origins, min_weight, index_of_cell, first, last, row, vertices):
     """A vertex (grid units) for each cell of some blocks that the surface crosses, from a row on; returns the row after
     them. Without room for ``vertices`` they are only counted."""
     values, vertex = np.zeros(8), np.zeros(3)
     for slot in range(first, last):
         for voxel in range(512):
             i, j, k = voxel >> 6, (voxel >> 3) & 7, voxel & 7
-            if not _corners(distance, weight, neighbours, slot, i, j, k, least_weight, values):
+            if not _corners(distance, weight, neighbours, slot, i, j, k, min_weight, values):
                 continue
             if vertices.shape[0] > 0:
                 _cell_vertex(values, vertex)
@@ -111,18 +111,18 @@ def _quad_around(index_of_cell, neighbours, slot, i, j, k, axis, quad):
 
 @kernel
 @no_type_check
-def _faces(distance, weight, neighbours, index_of_cell, least_weight, first, last, row, faces):
+def _faces(distance, weight, neighbours, index_of_cell, min_weight, first, last, row, faces):
     """Two triangles for each grid edge of some blocks that the surface crosses, as :func:`_vertices`."""
     quad = np.zeros(4, np.int64)
     for slot in range(first, last):
         for voxel in range(512):
-            if weight[slot, voxel] < least_weight:
+            if weight[slot, voxel] < min_weight:
                 continue
             i, j, k = voxel >> 6, (voxel >> 3) & 7, voxel & 7
             here = distance[slot, voxel] < 0
             for axis in range(3):
                 other, index = _place(neighbours, slot, i + (axis == 0), j + (axis == 1), k + (axis == 2))
-                if other < 0 or weight[other, index] < least_weight or (distance[other, index] < 0) == here:
+                if other < 0 or weight[other, index] < min_weight or (distance[other, index] < 0) == here:
                     continue
                 if not _quad_around(index_of_cell, neighbours, slot, i, j, k, axis, quad):
                     continue
@@ -157,7 +157,7 @@ class _Grid:
     weight: Float[np.ndarray, "b v"]
 
     def surface(
-        self, least_weight: float
+        self, min_weight: float
     ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, "v"]]:
         """Vertices (grid units) and faces of the zero level, and which block each vertex is in. The third corner of the
         first and the second of the second triangle of each pair is in the block that the pair belongs to."""
@@ -165,22 +165,22 @@ class _Grid:
         origins = unpack(self.keys).astype(np.float64) * BLOCK
         grid = (self.distance, self.weight, find(self.keys, around(self.keys)))
         blocks = len(self.keys)
-        vertices = _rows(partial(_vertices, *grid, origins, least_weight, index_of_cell), blocks, np.float64)
-        faces = _rows(partial(_faces, *grid, index_of_cell, least_weight), blocks, np.int64)
+        vertices = _rows(partial(_vertices, *grid, origins, min_weight, index_of_cell), blocks, np.float64)
+        faces = _rows(partial(_faces, *grid, index_of_cell, min_weight), blocks, np.int64)
         return vertices, faces, np.repeat(np.arange(len(self.keys)), (index_of_cell >= 0).sum(axis=1))
 
 
-def extract(volume: SparseVolume, least_weight: float) -> Mesh:
-    """The zero level of the volume, where all voxels around it have at least the weight ``least_weight``."""
+def extract(volume: SparseVolume, min_weight: float) -> Mesh:
+    """The zero level of the volume, where all voxels around it have at least the weight ``min_weight``."""
     keys = volume.keys
     if len(keys) == 0:
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     grid = _Grid(keys, volume.distance[: len(keys)], volume.weight[: len(keys)])
-    vertices, faces, _ = grid.surface(least_weight)
+    vertices, faces, _ = grid.surface(min_weight)
     return Mesh(vertices * volume.voxel_mm, faces)
 
 
-def extract_parts(volume: SparseVolume, least_weight: float, parts: Iterable[int]) -> dict[int, Mesh]:
+def extract_parts(volume: SparseVolume, min_weight: float, parts: Iterable[int]) -> dict[int, Mesh]:
     """The same in some parts of the volume, by their keys (:func:`part_of`), each with vertices of its own: together
     the parts are the whole."""
     asked, keys = np.array(sorted(parts), dtype=np.int64), volume.keys
@@ -191,7 +191,7 @@ def extract_parts(volume: SparseVolume, least_weight: float, parts: Iterable[int
         return found
     near = np.flatnonzero(np.isin(keys, around(owned)))
     grid = _Grid(keys[near], volume.distance[near], volume.weight[near])
-    vertices, faces, block = grid.surface(least_weight)
+    vertices, faces, block = grid.surface(min_weight)
     part = np.repeat(part_of(grid.keys)[block[faces[::2, 2]]], 2)
     mesh = Mesh(vertices * volume.voxel_mm, faces)
     return found | {key: mesh.submesh(part == key) for key in np.intersect1d(part, asked).tolist()}

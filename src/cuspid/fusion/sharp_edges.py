@@ -50,11 +50,11 @@ class SharpEdgeOptions(Options):
     inner: Annotated[float, Range(0, 1000)] = 5.0
     """What lies within this distance from an edge may be rounded or cut off, and does not tell where it is (0.06 mm at
     12 um)."""
-    most_outwards: Annotated[float, Range(0.01, 1000)] = 2.0
+    max_outwards: Annotated[float, Range(0.01, 1000)] = 2.0
     """What lies farther below an edge than measuring rounds it (0.024 mm at 12 um) is round."""
     flatness: Annotated[float, Range(0.001, 1000)] = 0.5
     """Largest RMS distance of the flanks from planes (0.006 mm at 12 um)."""
-    least_angle_deg: Annotated[float, Range(1, 179)] = 30.0
+    min_angle_deg: Annotated[float, Range(1, 179)] = 30.0
     """Smallest angle between the flanks' normals."""
     roundness: Annotated[float, Range(0, 1)] = 0.025
     """Largest mean squared angle to the nearer flank, as a share of the squared angle between them: 0.083 for what is
@@ -85,7 +85,7 @@ def _move_to_edges(
 ) -> Float[np.ndarray, "v 3"]:
     """The vertices, with those of the candidates that an edge asks for on it."""
     foot, along = _lines(mesh, candidates, detail_mm, options)
-    places = _onto_edges(mesh, foot, along, options.most_outwards * detail_mm)
+    places = _onto_edges(mesh, foot, along, options.max_outwards * detail_mm)
     return _without_turned(mesh, np.flatnonzero(np.isfinite(places[:, 0])), places)
 
 
@@ -138,7 +138,7 @@ def _lines(
     limits = _Limits(
         reach=options.reach * detail_mm,
         inner=options.inner * detail_mm,
-        angle=float(np.deg2rad(options.least_angle_deg)),
+        angle=float(np.deg2rad(options.min_angle_deg)),
         flatness=options.flatness * detail_mm,
         roundness=options.roundness,
     )

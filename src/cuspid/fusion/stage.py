@@ -119,8 +119,8 @@ def _what_took_it(funnel: Funnel | None, faces: int) -> str:
         }
         return f"{told}; {advice[funnel.narrowest] if funnel else 'the images need texture or sharper focus'}"
     if not faces:
-        return f"no {FusionOptions.least_maps} depth maps confirm the same surface ({funnel.summary}); check the poses"
-    return f"cleaning removed all of {faces:,} faces; lower --cleaning.least-piece-width ({funnel.summary})"
+        return f"no {FusionOptions.min_maps} depth maps confirm the same surface ({funnel.summary}); check the poses"
+    return f"cleaning removed all of {faces:,} faces; lower --cleaning.min-piece-width ({funnel.summary})"
 
 
 def _sigma_um(mesh: Mesh, raw: Fused, expected: Expectation | None) -> Float[np.ndarray, "v"]:

@@ -16,7 +16,7 @@
     lingual = 0.90
 
     [cameras]
-    most = 12
+    max = 12
 
     [motion]
     turns = 1                           # 3, 5 ...: the handpiece is also rolled
@@ -69,7 +69,7 @@ class MouthBrief:
 class CamerasBrief:
     """How many cameras, and how near to each other they can be built."""
 
-    most: int = 12
+    max: int = 12
     """Largest number."""
     spacing_mm: float = 1.2
     """Least distance between two of them."""
@@ -127,7 +127,7 @@ class DesignBrief:
         _check(len(self.surfaces) > 0, "[surfaces] is empty; name at least one that must be seen")
         for surface, share in self.surfaces.items():
             _check(0 < share <= 1, f"the share of surface {shown(surface)} is {share:g}; it must lie between 0 and 1")
-        _check(self.cameras.most >= 2, f"cameras.most is {self.cameras.most}; depth needs at least two")
+        _check(self.cameras.max >= 2, f"cameras.max is {self.cameras.max}; depth needs at least two")
         _check(
             self.cameras.spacing_mm >= self.sensor.sensor_width_mm,
             f"cameras.spacing_mm is {self.cameras.spacing_mm:g}, less than the width of the sensor, "

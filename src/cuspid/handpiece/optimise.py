@@ -183,7 +183,7 @@ class Design:
         unmet = self.best.assessment.unmet
         if unmet:
             raise InputError(
-                f"brief: no handpiece with at most {brief.cameras.most} cameras was found that meets it; the best "
+                f"brief: no handpiece with at most {brief.cameras.max} cameras was found that meets it; the best "
                 f"one fails on {'; '.join(map(str, unmet))}"
             )
 
@@ -209,7 +209,7 @@ def optimise_handpiece(
     brief.check_gap(gap_mm)
     _check_surfaces(brief, sections)
     search = _Search(brief, sections, gap_mm, options)
-    layouts = [layout for layout in LAYOUTS if layout.cameras <= brief.cameras.most]
+    layouts = [layout for layout in LAYOUTS if layout.cameras <= brief.cameras.max]
     trials = []
     for done, layout in enumerate(layouts, start=1):
         trials.append(search.explore(layout))
@@ -372,7 +372,7 @@ def _room(handpiece: Handpiece, brief: DesignBrief, sections: Sequence[Section],
     heights, clearances = zip(*(_height_and_clearance(handpiece, brief, each) for each in sections), strict=True)
     at_most = {
         "height above the teeth, mm": (gap_mm, max(heights)),
-        "cameras": (float(brief.cameras.most), float(len(rig))),
+        "cameras": (float(brief.cameras.max), float(len(rig))),
     }
     if brief.width_mm is not None:
         at_most["width, mm"] = (brief.width_mm, float(np.ptp(handpiece_outline(handpiece, brief.thickness_mm)[:, 0])))

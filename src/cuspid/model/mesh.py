@@ -257,20 +257,20 @@ class Mesh(Viewable):
         tree.init(self.vertices, self.faces)
         return tree
 
-    def simplified(self, most_faces: int) -> Mesh:
+    def simplified(self, max_faces: int) -> Mesh:
         """The mesh with at most so many faces, or as few as possible, by collapsing edges where it matters least
         (quadric error metric, Garland and Heckbert 1997); the mesh itself if it has no more. Colours are lost.
 
         In a mesh of millions of faces, vertices closer together than those of the result will be are merged first: the
         collapse takes 300 bytes a face, which its library does not release.
         """
-        if len(self.faces) <= most_faces:
+        if len(self.faces) <= max_faces:
             return self
-        start = self.thinned(max(_MOST_COLLAPSED, 4 * most_faces))
+        start = self.thinned(max(_MOST_COLLAPSED, 4 * max_faces))
         vertices, faces = start.vertices.astype(np.float64), start.faces.astype(np.int32)
-        while len(faces) > most_faces:
+        while len(faces) > max_faces:
             before = len(faces)
-            vertices, faces = fast_simplification.simplify(vertices, faces, target_count=most_faces)
+            vertices, faces = fast_simplification.simplify(vertices, faces, target_count=max_faces)
             if len(faces) > 0.95 * before:  # it may give up early, and go on when it is asked again
                 break
         return Mesh(vertices, faces)

@@ -45,13 +45,13 @@ the designs that come with cuspid."""
 class PairingOptions(Options):
     """When two cameras see the same surface, from about the same side."""
 
-    minimum_overlap: Annotated[float, SHARE] = 0.4
+    min_overlap: Annotated[float, SHARE] = 0.4
     """Share (0 to 1) of what either camera sees at the working distance that the other must see too."""
-    maximum_angle_deg: Annotated[float, Range(0, 180)] = 60.0
+    max_angle_deg: Annotated[float, Range(0, 180)] = 60.0
     """Largest angle between their optical axes."""
-    maximum_sources: Annotated[int, Range(1, 100)] = 6
+    max_sources: Annotated[int, Range(1, 100)] = 6
     """Each view is matched with no more than this many others, the best ones."""
-    minimum_share: Annotated[float, SHARE] = 0.15
+    min_share: Annotated[float, SHARE] = 0.15
     """A view is not matched with those that are worth less than this share (0 to 1) of the best one: 20 degrees apart
     is best, 33 degrees are worth 0.7 of it, 40 degrees 0.4 and 50 degrees 0.1."""
 
@@ -70,10 +70,10 @@ def rank_sources(
     names, worth = rig.names, np.zeros((len(rig.names),) * 2)
     for one, other in combinations(range(len(names)), 2):
         pair = names[one], names[other]
-        if rig.angle_deg(*pair) > options.maximum_angle_deg + _ROUNDING_DEG:
+        if rig.angle_deg(*pair) > options.max_angle_deg + _ROUNDING_DEG:
             continue
         shared = _shared_view(rig, pair, distance_mm)
-        if shared >= options.minimum_overlap:
+        if shared >= options.min_overlap:
             angles = np.array([rig.meeting_deg(*pair, distance_mm), rig.meeting_deg(*pair[::-1], distance_mm)])
             worth[one, other], worth[other, one] = shared * worth_of_angle(angles)
     return {name: tuple(names[k] for k in _best(row, options)) for name, row in zip(names, worth, strict=True)}
@@ -110,8 +110,8 @@ def rank_by_points(
 
 def _best(worth: Float[np.ndarray, "v"], options: PairingOptions) -> tuple[int, ...]:
     """Indices of the views that are worth enough, best first."""
-    order = np.argsort(-worth, kind="stable")[: options.maximum_sources]
-    least = max(options.minimum_share * worth.max(initial=0.0), _LEAST_WORTH)
+    order = np.argsort(-worth, kind="stable")[: options.max_sources]
+    least = max(options.min_share * worth.max(initial=0.0), _LEAST_WORTH)
     return tuple(int(k) for k in order if worth[k] >= least)
 
 
@@ -144,7 +144,7 @@ def guess_working_distance_mm(rig: Rig) -> tuple[float, str]:
     camera begins to share enough with its best partner (median; within a factor of two for the designs that come with
     cuspid). Raises InputError if no two of the cameras can be a pair.
     """
-    limit_deg = PairingOptions.maximum_angle_deg
+    limit_deg = PairingOptions.max_angle_deg
     pairs = [pair for pair in combinations(rig.names, 2) if rig.angle_deg(*pair) <= limit_deg]
     if not pairs:
         raise InputError("the working distance cannot be told from the cameras: no two of them look the same way")

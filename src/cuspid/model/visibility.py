@@ -36,7 +36,7 @@ _AT_ONCE = (1, 2, 3)
 class VisibilityOptions(Options):
     """When a face counts as seen."""
 
-    maximum_incidence_deg: Annotated[float, Range(1, 90)] = 75.0
+    max_incidence_deg: Annotated[float, Range(1, 90)] = 75.0
     """Largest angle between the line of sight and the normal of the face."""
     cameras: Annotated[int, Range(1, 1000)] = 2
     """Number of cameras that must see a face at once."""
@@ -269,7 +269,7 @@ def _visible_among(
     mesh: Mesh, view: _View, cam_from_world: Rigid3, options: VisibilityOptions, faces: Int[np.ndarray, "n"]
 ) -> Int[np.ndarray, "m"]:
     """Those of the faces that a camera sees."""
-    minimum_cosine = float(np.cos(np.deg2rad(options.maximum_incidence_deg)))
+    minimum_cosine = float(np.cos(np.deg2rad(options.max_incidence_deg)))
     eye = cam_from_world.inverse().translation
     facing = _facing(
         mesh.face_centres,

@@ -36,7 +36,7 @@ def epipolar_offset_px(
     """Median distance of the matches of a pair of cameras from their epipolar lines, the largest over the pairs and
     frames; None where no pair has matches enough to tell."""
     handpiece, frames = capture.handpiece, [frame.name for frame in capture.frames]
-    features = detect_all(Pictures(capture, most_bytes=0), options.sought, progress=progress, cache=cache)
+    features = detect_all(Pictures(capture, max_bytes=0), options.sought, progress=progress, cache=cache)
     pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
     within, offsets = replace(options.within, tolerance_px=_REACH_PX), list[float]()
     for views in (indexed(handpiece.rig, features, name) for name in frames):

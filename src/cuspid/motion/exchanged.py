@@ -109,7 +109,7 @@ def check_cameras(
     first = max(0, (count - _FRAMES) // 2)
     few = replace(capture, frames=capture.frames[first : first + _FRAMES])
     names = [frame.name for frame in few.frames]
-    features = detect_all(Pictures(few, most_bytes=0), options.sought, progress=progress, cache=cache)
+    features = detect_all(Pictures(few, max_bytes=0), options.sought, progress=progress, cache=cache)
     return check_features(handpiece, features, names, options)
 
 

@@ -76,7 +76,7 @@ class MotionOptions(Options):
     cell_px: Annotated[float | None, Range(0, 10_000)] = None
     """In each cell of this size, an image keeps its longest track for the adjustment; 0 keeps all tracks. Default: a
     tenth of the shorter side."""
-    minimum_located: Annotated[float, SHARE] = 0.5
+    min_located: Annotated[float, SHARE] = 0.5
     """Minimum share (0 to 1) of the frames that must be located."""
     adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
     """The final refinement."""
@@ -241,7 +241,7 @@ def _tracks(scan: _Scan, matches: Sequence[Int[np.ndarray, "_ 2"]], cell_px: flo
 def _require_enough(trajectory: Trajectory, clouds: Sequence[Cloud], options: MotionOptions) -> None:
     """Raise ReconstructionError where too few frames are located."""
     placed, total = len(trajectory.rig_from_world), len(clouds)
-    if placed >= options.minimum_located * total and (placed > 1 or total == 1):
+    if placed >= options.min_located * total and (placed > 1 or total == 1):
         return
     shown = "; ".join(f"{d.what}: {d.reason}" for d in trajectory.dropped[:3])
     more = f"; and {len(trajectory.dropped) - 3} more" if len(trajectory.dropped) > 3 else ""
@@ -294,7 +294,7 @@ def locate_features(
     else:
         rough = _located(handpiece, taken, taken, _roughly(options, handpiece), None, progress)
         found = _located(handpiece, taken, _at_instants(taken, rough), options, refined, progress)
-    noted = with_advice(found, options.odometry.minimum_matches)
+    noted = with_advice(found, options.odometry.min_matches)
     return noted.with_cameras_as(given)
 
 
@@ -452,7 +452,7 @@ def _adjust_and_reconnect(
     with _log_time(log, "patches"):
         placed = match_patches(adjusted, read, options.least_squares, progress=progress)
         found = np.bincount(placed.frame_index, minlength=len(adjusted.frames))
-        few = np.flatnonzero(found < options.odometry.minimum_matches)
+        few = np.flatnonzero(found < options.odometry.min_matches)
         if len(few):
             note = (
                 f"motion: in {len(few)} frames (first: {adjusted.frames[few[0]]}) hardly any patches could be matched, "
@@ -477,7 +477,7 @@ def locate(
     """
     options, log = options or MotionOptions(), dict[str, float]()
     require_stereo(capture.handpiece, options.pairing)
-    pictures = Pictures(capture) if options.least_squares.enabled else Pictures(capture, most_bytes=0)
+    pictures = Pictures(capture) if options.least_squares.enabled else Pictures(capture, max_bytes=0)
     with _log_time(log, "features"):
         features = detect_all(pictures, options.sought, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]

@@ -94,7 +94,7 @@ def refine_rig_on_surface(
         return source.read(frame, camera)[..., 0]
 
     followed = follow_rig_points(found, read, patches, surface=surface, progress=progress)
-    least = options.odometry.minimum_matches
+    least = options.odometry.min_matches
     if not hold_together(followed, len(found.frames), least):
         return None
     rig = capture.handpiece.rig.in_own_order()

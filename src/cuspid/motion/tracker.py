@@ -66,7 +66,7 @@ class Tracker:
     def push(self, name: str, features: Mapping[tuple[str, str], Features]) -> Placed:
         """Place the next frame."""
         frame = self._seen(name, features)
-        least = self._options.odometry.minimum_matches
+        least = self._options.odometry.min_matches
         if len(frame.cloud.points) < least:
             return self._left(f"only {len(frame.cloud.points)} points seen in stereo; {least} are needed")
         if not self.rig_from_world:

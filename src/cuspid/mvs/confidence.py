@@ -41,7 +41,7 @@ class ConfidenceOptions(Options):
     """How many standard deviations."""
     smooth_sigmas: Annotated[float, Range(0, 100)] = 2.0
     """Depths of smooth surfaces agree within so many standard deviations, that is, within a pixel of disparity."""
-    largest_sigma: Annotated[float, Range(0.001, 1000)] = 5 / 6
+    max_sigma: Annotated[float, Range(0.001, 1000)] = 5 / 6
     """A depth with a larger standard deviation, in resolutions (0.01 mm at 12 um), is dropped."""
     best_sigma: Annotated[float, Range(0.0001, 100)] = 1 / 6
     """Standard deviation, in resolutions at the working distance (0.002 mm at 12 um), that gives confidence 1; the
@@ -195,7 +195,7 @@ def _shift_values(values: Float[np.ndarray, "h w"], down: int, right: int) -> Fl
 
 def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:
     """True where the standard deviation of the depth is small enough; that of a smooth surface is known to be large."""
-    sure = np.asarray(one.sigma_mm <= options.largest_sigma * resolution.at(one.depth_mm))
+    sure = np.asarray(one.sigma_mm <= options.max_sigma * resolution.at(one.depth_mm))
     return sure if one.smooth is None else sure | one.smooth
 
 

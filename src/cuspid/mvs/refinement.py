@@ -73,7 +73,7 @@ class RefinementOptions(Options):
     weak_zncc: Annotated[float, Range(-1, 1)] = 0.6
     """Lower bound of that limit in weaker texture: noise of standard deviation n reduces the correlation of a texture
     of standard deviation c to the share c^2 / (c^2 + n^2)."""
-    least_contrast: Annotated[float, Range(0, 1000)] = 1.2
+    min_contrast: Annotated[float, Range(0, 1000)] = 1.2
     """Standard deviation of what no plane explains of a window's brightness, in multiples of that of the noise, below
     which it has no texture: what a plane explains is shade."""
     propagations: Annotated[int, Range(0, 100)] = 1
@@ -127,7 +127,7 @@ class _Limits(NamedTuple):
     accept: float
     weak: float
     noise2: float
-    least_contrast: float
+    min_contrast: float
     effective: float
 
 
@@ -499,7 +499,7 @@ def _visit(view, limits, buffers, initial, field, row, column, direction):
     if count == 0:
         return
     contrast = _load_template(view, u, v, buffers.template)
-    if contrast * np.sqrt(_detail(view.window, buffers.template)) < limits.least_contrast:
+    if contrast * np.sqrt(_detail(view.window, buffers.template)) < limits.min_contrast:
         return
     plane = buffers.candidates[_best_start(view, limits, buffers, u, v, count)]
     if not _refine_plane(view, limits, buffers, u, v, plane):
@@ -547,7 +547,7 @@ def _refine_half(view, limits, buffers, field, row, column, side):
         return False
     spacing, plane = view.spacing, buffers.candidates[0]
     u, v = spacing // 2 + column * spacing, spacing // 2 + row * spacing
-    if _load_template(view, u, v, buffers.template) < limits.least_contrast:
+    if _load_template(view, u, v, buffers.template) < limits.min_contrast:
         return False
     plane[1], plane[2] = field[side[0], side[1], Q_U], field[side[0], side[1], Q_V]
     plane[0] = field[side[0], side[1], Q] + spacing * ((column - side[1]) * plane[1] + (row - side[0]) * plane[2])
@@ -629,7 +629,7 @@ def refine(
         accept=options.accept_zncc,
         weak=options.weak_zncc,
         noise2=noise_dn**2,
-        least_contrast=options.least_contrast * noise_dn,
+        min_contrast=options.min_contrast * noise_dn,
         effective=_effective(window),
     )
     buffers = _new_buffers(window.shape[1], len(geometry.others), len(initial_mm))

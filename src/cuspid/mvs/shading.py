@@ -107,7 +107,7 @@ class ShadingOptions(Options):
     """Refractive index of the surface, by which less of its light leaves it at grazing angles; 1 for what is matte.
     Only lights of one colour need it."""
     confidence: ConfidenceOptions = field(
-        default_factory=lambda: ConfidenceOptions(agreement_sigmas=1.0, largest_sigma=4.0, best_sigma=1.0)
+        default_factory=lambda: ConfidenceOptions(agreement_sigmas=1.0, max_sigma=4.0, best_sigma=1.0)
     )
     """Checks and weights. Shade is broad: the limits are wider than those for texture. Smooth surfaces agree easily
     where two cameras are deceived alike, so that standard deviations excuse less."""

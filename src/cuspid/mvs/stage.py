@@ -177,19 +177,19 @@ def measure_depth_across(
     stereo: StereoOptions,
     *,
     agreement_mm: float,
-    least_maps: int,
+    min_maps: int,
     holes: SurfacePoints | None = None,
     progress: Progress = silent,
 ) -> StoredDepthMaps:
     """Depth maps of cameras matched with themselves at the next located frame of the same lighting pattern, kept in
     ``folder``, for those cameras that fill holes (:attr:`AcrossOptions.left_share`). Holes are where fewer than
-    ``least_maps`` of ``depths`` confirm the sparse points within ``agreement_mm``, and the further places given as
+    ``min_maps`` of ``depths`` confirm the sparse points within ``agreement_mm``, and the further places given as
     ``holes``."""
     steps = _steps(capture, found.rig_from_world, stereo)
     left_share = _LEFT_SHARE if options.left_share is None else options.left_share
     if found.tracks is not None and left_share > 0:
         sightings = Sightings.of(found, found.tracks)
-        missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < least_maps
+        missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < min_maps
         tried = [(step, camera) for step in steps.values() for camera in step.now.cameras]
         taken = _that_fill_holes(tried, sightings, missing, left_share)
         if holes is not None:

@@ -316,7 +316,7 @@ def _textured_depth(
     return depths | measure_depth_across(
         *(capture, found, depths, folder / "depth-across", options.across, stereo),
         agreement_mm=agreement_mm,
-        least_maps=options.fusion.least_maps,
+        min_maps=options.fusion.min_maps,
         holes=holes,
         progress=progress,
     )

@@ -177,7 +177,7 @@ class Session:
     def _features(self, frame: Frame) -> Mapping[tuple[str, str], Features]:
         one = replace(self._capture, frames=(frame,))
         cache = self._folder / "motion" / "cache"
-        return detect_all(Pictures(one, most_bytes=0), self._settled.tracking.sought, cache=cache)
+        return detect_all(Pictures(one, max_bytes=0), self._settled.tracking.sought, cache=cache)
 
     def _find_again(self, name: str) -> Mapping[tuple[str, str], Features]:
         return self._features(next(frame for frame in self.frames if frame.name == name))

@@ -77,9 +77,9 @@ def _(value: Capture, path: Path) -> None:
     Image.fromarray(_tiled([_fitted(image, _TILE_PX) for image in value.images(frame).values()])).save(path)
 
 
-def _fitted(image: UInt8[np.ndarray, "h w 3"], most_px: int) -> UInt8[np.ndarray, "a b 3"]:
+def _fitted(image: UInt8[np.ndarray, "h w 3"], max_px: int) -> UInt8[np.ndarray, "a b 3"]:
     """The image, made smaller where a side is longer."""
-    scale = min(1.0, most_px / max(image.shape[:2]))
+    scale = min(1.0, max_px / max(image.shape[:2]))
     if scale == 1:
         return image
     size = max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)

@@ -49,7 +49,7 @@ class PhotographOptions(Options):
 
     instants: Annotated[int, Range(1, 10_000)] = 36
     """Number of times that the board is shown."""
-    most_tilt_deg: Annotated[float, Range(0, 70)] = 40.0
+    max_tilt_deg: Annotated[float, Range(0, 70)] = 40.0
     """Maximum tilt of the board from facing the camera."""
     supersampling: Annotated[int, Range(1, 16)] = 3
     """Rays per pixel along each side."""
@@ -73,7 +73,7 @@ def board_poses(handpiece: Handpiece, board: Board, options: PhotographOptions) 
 def _any_pose(distance_mm: float, board: Board, options: PhotographOptions, rng: np.random.Generator) -> Rigid3:
     """``cam_from_board`` of a board before a camera."""
     towards, turn = rng.uniform(-np.pi, np.pi, 2)
-    tilt = np.deg2rad(options.most_tilt_deg) * np.sqrt(rng.uniform())
+    tilt = np.deg2rad(options.max_tilt_deg) * np.sqrt(rng.uniform())
     axis = np.array([np.cos(towards), np.sin(towards), 0])
     rotation = (Rotation.from_rotvec(tilt * axis) * Rotation.from_euler("z", turn)).as_matrix()
     middle = distance_mm * np.array([*rng.normal(0, _ASIDE, 2), rng.uniform(_NEAR, _FAR)])

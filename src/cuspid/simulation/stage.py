@@ -83,7 +83,7 @@ def simulate(
     true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
     _check(true, options)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
-    overlaps = path.minimum_overlap, path.mean_overlap
+    overlaps = path.min_overlap, path.mean_overlap
     write_path(folder / "truth" / "path.json", *overlaps, path.seen, path.cross_sweep)
     return take_images(
         jaw,

@@ -30,7 +30,7 @@ def read_truth(folder: Path) -> GroundTruth:
 
 
 def write_path(
-    path: Path, minimum_overlap: float, mean_overlap: float, seen: Mapping[int, float], cross_sweep: Sequence[str] = ()
+    path: Path, min_overlap: float, mean_overlap: float, seen: Mapping[int, float], cross_sweep: Sequence[str] = ()
 ) -> None:
     """Write what is known of a path before anything is rendered.
 
@@ -38,5 +38,5 @@ def write_path(
     ``cross_sweep`` names the frames of the sweep from one side of the arch to the other.
     """
     shares = {"all" if tooth == GUM else str(tooth): share for tooth, share in seen.items()}
-    overlaps = {"minimum_overlap": minimum_overlap, "mean_overlap": mean_overlap}
+    overlaps = {"minimum_overlap": min_overlap, "mean_overlap": mean_overlap}
     write_json(path, {**overlaps, "crowns_seen": shares, "cross_sweep_frames": list(cross_sweep)})

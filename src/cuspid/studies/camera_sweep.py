@@ -104,7 +104,7 @@ class SweepOptions(Options):
     """Positions of the pair on the path; consecutive images must overlap by more than 75 %."""
     texture: Preset = "artificial"
     """Surface of the teeth: artificial (the thesis' condition), powder, enamel."""
-    pairing: PairingOptions = field(default_factory=lambda: PairingOptions(minimum_overlap=0.0))
+    pairing: PairingOptions = field(default_factory=lambda: PairingOptions(min_overlap=0.0))
     """When the two cameras are matched at all. By default whatever their overlap at the distance is, because a wide,
     parallel pair overlaps more behind it."""
     across: bool = False

@@ -88,7 +88,7 @@ class ComparisonOptions(Options):
     image_scale: Annotated[float, Range(0.01, 1)] = 1.0
     """Factor by which all images are reduced: 0.5 takes a quarter of the time, but more than doubles the errors and
     loses steep faces."""
-    minimum_openness: Annotated[float, Range(0, 0.99)] = LEAST_OPENNESS
+    min_openness: Annotated[float, Range(0, 0.99)] = LEAST_OPENNESS
     """A face is evaluated for completeness if at least this share of the directions above the occlusal plane is
     free."""
     samples: Annotated[int, Range(1, 20_000_000)] = 60_000
@@ -251,9 +251,9 @@ def scan_case(
     }
 
 
-def open_surfaces(jaw: Jaw, tooth: int, minimum_openness: float) -> dict[str, Bool[np.ndarray, "f"]]:
+def open_surfaces(jaw: Jaw, tooth: int, min_openness: float) -> dict[str, Bool[np.ndarray, "f"]]:
     """The open faces of a tooth, by the names of its surfaces."""
-    is_open = open_faces(jaw.mesh, jaw.tooth_faces(tooth), minimum_openness)
+    is_open = open_faces(jaw.mesh, jaw.tooth_faces(tooth), min_openness)
     named = {name: mask & is_open for name, mask in named_surfaces(jaw).items()}
     return {name: mask for name, mask in named.items() if mask.any()}
 
@@ -262,7 +262,7 @@ def tooth_completeness(
     jaw: Jaw, aligned: Mesh, scannable: Bool[np.ndarray, "f"], tooth: int, options: ComparisonOptions
 ) -> dict[str, float]:
     """Shares in % of the open faces of a tooth: seen by two cameras at once, and within some um of the aligned scan."""
-    surfaces = open_surfaces(jaw, tooth, options.minimum_openness)
+    surfaces = open_surfaces(jaw, tooth, options.min_openness)
     indices = np.flatnonzero(np.any(list(surfaces.values()), axis=0))
     surface = Mesh(jaw.mesh.vertices, jaw.mesh.faces[indices])
     points, picks = surface.sample(options.samples, np.random.default_rng(0))

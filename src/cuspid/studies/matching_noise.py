@@ -72,9 +72,9 @@ class MatchingNoiseOptions(Options):
     """Standard deviation of the starting position along the epipolar line."""
     window_px: Annotated[int, Range(3, 1001)] = 7
     """Side of the upright window; the slanted one has the same size."""
-    largest_error_px: Annotated[float, Range(0.01, 1000)] = 1.0
+    max_error_px: Annotated[float, Range(0.01, 1000)] = 1.0
     """A match farther off than this counts as failed, not as noise."""
-    maximum_incidence_deg: Annotated[float, Range(1, 90)] = 75.0
+    max_incidence_deg: Annotated[float, Range(1, 90)] = 75.0
     """Points that a camera sees at a larger angle of incidence are left out."""
 
 
@@ -139,7 +139,7 @@ def _sample_pair(
     samples: dict[Matcher, MatchingSamples] = {}
     for matcher in MATCHING:
         errors = np.sum((found[matcher] - true_px) * epipolar, axis=1)
-        errors[~(np.abs(errors) <= options.largest_error_px)] = np.nan
+        errors[~(np.abs(errors) <= options.max_error_px)] = np.nan
         samples[matcher] = MatchingSamples(
             convergence_deg=np.full(len(errors), angle), deformation=deformations, error_px=errors
         )
@@ -187,7 +187,7 @@ def _true_points(jaw: Jaw, cameras: Sequence[MountedCamera], pose: Rigid3, optio
     for mounted in cameras:
         eye = (mounted.cam_from_rig @ pose).inverse().translation
         sight = (eye - in_world) / np.linalg.norm(eye - in_world, axis=1, keepdims=True)
-        good &= np.sum(sight * normals, axis=1) >= np.cos(np.deg2rad(options.maximum_incidence_deg))
+        good &= np.sum(sight * normals, axis=1) >= np.cos(np.deg2rad(options.max_incidence_deg))
         good &= ~jaw.mesh.occluded(in_world, np.broadcast_to(eye, in_world.shape))
     known = np.zeros((grid.height, grid.width), dtype=bool)
     known.ravel()[pixels[good]] = True

@@ -23,13 +23,13 @@ from cuspid.runtime.options import Options, Range
 class ExaminationOptions(Options):
     """What the homography between consecutive frames may do; the defaults are those of the thesis."""
 
-    smallest_angle_deg: Annotated[float, Range(0, 90)] = 80.0
+    min_angle_deg: Annotated[float, Range(0, 90)] = 80.0
     """Smallest inner angle at a warped corner."""
-    largest_angle_deg: Annotated[float, Range(90, 180)] = 110.0
+    max_angle_deg: Annotated[float, Range(90, 180)] = 110.0
     """Largest inner angle at a warped corner."""
-    largest_translation: Annotated[float, Range(0.001, 100)] = 0.10
+    max_translation: Annotated[float, Range(0.001, 100)] = 0.10
     """Largest shift of the frame's centre, as a share (0 to 1) of the fixed frame's width and of its height."""
-    smallest_scale: Annotated[float, Range(0.001, 0.999)] = 0.85
+    min_scale: Annotated[float, Range(0.001, 0.999)] = 0.85
     """Smallest scale (square root of the ratio of areas); the largest is 1 over this."""
 
 
@@ -82,13 +82,13 @@ def examine(
 
 
 def _test_angles(angles: Float[np.ndarray, "4"], options: ExaminationOptions) -> str | None:
-    low, high = options.smallest_angle_deg, options.largest_angle_deg
+    low, high = options.min_angle_deg, options.max_angle_deg
     worst = angles[np.argmax(np.maximum(low - angles, angles - high))]
     return None if low <= worst <= high else f"corner angle: {worst:.0f} deg, not {low:g} to {high:g}"
 
 
 def _test_translation(shares: Float[np.ndarray, "2"], options: ExaminationOptions) -> str | None:
-    most = options.largest_translation
+    most = options.max_translation
     if shares.max() <= most:
         return None
     side = ("width", "height")[int(np.argmax(shares))]
@@ -96,5 +96,5 @@ def _test_translation(shares: Float[np.ndarray, "2"], options: ExaminationOption
 
 
 def _test_scale(scale: float, options: ExaminationOptions) -> str | None:
-    low = options.smallest_scale
+    low = options.min_scale
     return None if low <= scale <= 1 / low else f"scale: {scale:.2f}, not {low:g} to {1 / low:.2f}"

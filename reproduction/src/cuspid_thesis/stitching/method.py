@@ -57,10 +57,10 @@ class ThesisOptions(Options):
     """The examination of frames."""
     patience: Annotated[int, Range(1, 10_000)] = 5
     """After this many unusable frames in a row the panorama breaks, and a new part begins with them."""
-    largest_stretch: Annotated[float, Range(1.01, 1_000_000)] = 10.0
+    max_stretch: Annotated[float, Range(1.01, 1_000_000)] = 10.0
     """If the chain of homographies stretches or shrinks a frame by more than this factor, it has collapsed, and a new
     part begins."""
-    largest_canvas_mpx: Annotated[float, Range(0.01, 1000)] = 25.0
+    max_canvas_mpx: Annotated[float, Range(0.01, 1000)] = 25.0
     """Largest size of the panorama, in millions of px; beyond it a new part begins."""
     field_of_view_deg: Annotated[float, Range(1, 170)] = 60.0
     """Horizontal angle of view if there is no calibration."""
@@ -164,14 +164,14 @@ def overlap(fixed_from_moving: Float[np.ndarray, "3 3"], size: tuple[int, int]) 
 
 def collapse_of(placed: list[Placed], options: ThesisOptions) -> str | None:
     """How the last frame of a chain collapses: stretched too much, or on too large a canvas; None where it does not."""
-    worst = placed[-1].largest_stretch
+    worst = placed[-1].max_stretch
     if not np.isfinite(worst):
         return "the next frame reaches beyond the horizon"
-    if worst > options.largest_stretch:
+    if worst > options.max_stretch:
         return f"the next frame is stretched by a factor of {worst:.3g}"
     canvas = Canvas.around(placed)
-    if canvas.width * canvas.height > 1e6 * options.largest_canvas_mpx:
-        return f"the panorama grows beyond {options.largest_canvas_mpx:g} million px"
+    if canvas.width * canvas.height > 1e6 * options.max_canvas_mpx:
+        return f"the panorama grows beyond {options.max_canvas_mpx:g} million px"
     return None
 
 
@@ -200,7 +200,7 @@ def build_chain(
 def refusal(found: Link | None, before: int, size: tuple[int, int], options: ThesisOptions, examination: bool) -> str:
     """Why a frame must not be used; empty where it may."""
     if found is None:
-        return f"matches: fewer than {options.warps.fewest_inliers} agree with a homography to frame {before}"
+        return f"matches: fewer than {options.warps.min_inliers} agree with a homography to frame {before}"
     return "; ".join(examine(found.fixed_from_moving, size, options.limits)) if examination else ""
 
 

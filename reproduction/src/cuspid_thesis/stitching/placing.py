@@ -52,7 +52,7 @@ class Placed:
         return warp(self.cells[segment], pixels)
 
     @property
-    def largest_stretch(self) -> float:
+    def max_stretch(self) -> float:
         """The largest factor by which lengths grow or shrink, at the corners and at the segments' centroids; infinite
         beyond the horizon."""
         whole = stretch(np.broadcast_to(self.canvas_from_frame, (4, 3, 3)), frame_corners(self.size))

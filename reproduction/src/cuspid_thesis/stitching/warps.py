@@ -39,7 +39,7 @@ class WarpOptions(Options):
     """A match must be nearer than the second best by this factor (ratio test)."""
     error_px: Annotated[float, Range(0.01, 1000)] = 3.0
     """Distance in px within which a match is consistent with a homography."""
-    fewest_inliers: Annotated[int, Range(5, 100_000)] = 12
+    min_inliers: Annotated[int, Range(5, 100_000)] = 12
     """Minimum number of consistent matches."""
     near_px: Annotated[float, Range(0.01, 100_000)] = 40.0
     """A match has full weight up to this distance from a segment's centroid; beyond, its weight falls inversely with
@@ -119,11 +119,11 @@ def match(moving: Points, fixed: Points, ratio: float) -> Int[np.ndarray, "m 2"]
 def link(moving: Points, fixed: Points, options: WarpOptions) -> Link | None:
     """The homography that most matches agree with, or None where they are too few."""
     pairs = match(moving, fixed, options.ratio)
-    if len(pairs) < options.fewest_inliers:
+    if len(pairs) < options.min_inliers:
         return None
     source, target = moving.pixels[pairs[:, 0]], fixed.pixels[pairs[:, 1]]
     found, inlier = cv2.findHomography(source, target, cv2.RANSAC, options.error_px, maxIters=2000, confidence=0.999)
-    if found is None or inlier.sum() < options.fewest_inliers or abs(np.linalg.det(found)) < 1e-12:
+    if found is None or inlier.sum() < options.min_inliers or abs(np.linalg.det(found)) < 1e-12:
         return None
     keep = inlier.ravel() > 0
     return Link(fixed_from_moving=_upright(found), moving=source[keep], fixed=target[keep])

@@ -46,7 +46,7 @@ class FitOptions(Options):
     """Smoothing of the displacements in each round: standard deviation of a Gaussian over the surface, mm."""
     reach_mm: Annotated[float, Range(0.01, 100)] = 3.0
     """A nearest point farther away than this is no match."""
-    least_cosine: Annotated[float, Range(-1, 1)] = 0.5
+    min_cosine: Annotated[float, Range(-1, 1)] = 0.5
     """Minimum cosine between the normals; a nearest point whose normal differs by more is no match."""
 
 
@@ -213,7 +213,7 @@ def partners(
     for label, inner in template.inner.items():
         if label in target.patches and len(inner):
             offsets[inner], found[inner] = _onto_patch(
-                vertices[inner], normals[inner], target.patches[label], options.least_cosine
+                vertices[inner], normals[inner], target.patches[label], options.min_cosine
             )
     for border, on_border in template.borders.items():
         if border in target.borders:
@@ -225,13 +225,13 @@ def partners(
 
 
 def _onto_patch(
-    points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"], patch: Patch, least_cosine: float
+    points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"], patch: Patch, min_cosine: float
 ) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, "p"]]:
     distances, faces, nearest = patch.mesh.closest(points)
     offsets = nearest - points
     facing = patch.mesh.face_normals[faces]
     steep = np.abs(np.einsum("pk,pk->p", offsets, facing)) >= _ON_BORDER * distances
-    compatible = np.einsum("pk,pk->p", normals, facing) > least_cosine
+    compatible = np.einsum("pk,pk->p", normals, facing) > min_cosine
     return offsets, compatible & (steep | ~patch.at_rim[faces])
 
 

@@ -49,7 +49,7 @@ class MeanShapeOptions(Options):
     thesis; its mean keeps the detail of the first sample."""
     tolerance_um: Annotated[float, Range(0.001, 10_000)] = 5.0
     """The mean has converged when its surface moves by less than this (root mean square)."""
-    most_rounds: Annotated[int, Range(1, 1000)] = 10
+    max_rounds: Annotated[int, Range(1, 1000)] = 10
     """Maximum number of rounds; the iteration then ends, converged or not."""
     modes: Annotated[int, Range(1, 1000)] = 10
     """Maximum number of modes to keep."""
@@ -164,7 +164,7 @@ def _iterate(
         moved = replace(mean, vertices=np.mean([found.vertices for found in fits], axis=0))
         log.append(_step(mean, moved, fits))
         mean = moved
-        if log[-1].surface_change_um < options.tolerance_um or len(log) == options.most_rounds:
+        if log[-1].surface_change_um < options.tolerance_um or len(log) == options.max_rounds:
             return mean, fits, tuple(log)
 
 

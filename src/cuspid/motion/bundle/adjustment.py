@@ -91,7 +91,7 @@ class AdjustmentOptions(Options):
     tolerance: Annotated[float, Range(1e-12, 1000)] = 0.01
     """A round ends when the cost, in squared standard deviations, would fall by less than this: all unknowns together
     are then within its square root of their best values, measured in their standard deviations."""
-    minimum_angle_deg: Annotated[float, Range(0, 90)] = 1.0
+    min_angle_deg: Annotated[float, Range(0, 90)] = 1.0
     """Points whose rays meet at less than this angle are dropped."""
 
 
@@ -373,14 +373,14 @@ def _largest_angles_deg(state: State, observations: Observations) -> Float[np.nd
     return np.rad2deg(2 * np.arcsin(np.clip(np.maximum.reduceat(chord, observations.start[:-1]) / 2, 0, 1)))
 
 
-def _good(state: State, observations: Observations, limit_px: float, minimum_angle_deg: float) -> Bool[np.ndarray, "o"]:
+def _good(state: State, observations: Observations, limit_px: float, min_angle_deg: float) -> Bool[np.ndarray, "o"]:
     """Observations to keep: before the camera, near the projection, of points with two of them and enough angle."""
     counts = np.diff(observations.start)
     point = np.repeat(np.arange(len(counts)), counts)
     lengths = np.linalg.norm(residual_vectors(state, observations), axis=1)
     near = np.isfinite(lengths) & (lengths <= limit_px)
     seen = np.bincount(point, weights=near, minlength=len(counts)) >= 2
-    wide = _largest_angles_deg(state, observations) >= minimum_angle_deg
+    wide = _largest_angles_deg(state, observations) >= min_angle_deg
     return near & (seen & wide)[point]
 
 
@@ -635,7 +635,7 @@ def _minimize(
     state, colors = _initial_state(poses, tracks.points[points], prior, times), tracks.colors[points]
     sigma_px, limit_px, steps = options.sigma_px, options.start_px, 0
     for _ in range(options.rounds):
-        keep = _good(state, observations, limit_px, options.minimum_angle_deg)
+        keep = _good(state, observations, limit_px, options.min_angle_deg)
         if not keep.any():
             raise ReconstructionError("adjustment: no consistent points are left; check the handpiece's calibration")
         state, observations, colors = _select(state, observations, colors, keep)
@@ -674,7 +674,7 @@ def _misfits(
     state = found._replace(points=tracks.points[points])
     for _ in range(2):
         state = _in_front(refine_points(state, observations, weighting), state.points, observations)
-        keep = _good(state, observations, options.start_px, options.minimum_angle_deg)
+        keep = _good(state, observations, options.start_px, options.min_angle_deg)
         state, observations, _ = _select(state, observations, np.zeros((len(state.points), 3), np.uint8), keep)
     return held_misfit(refine_points(state, observations, weighting), observations, weighting, prior.rig.names)
 

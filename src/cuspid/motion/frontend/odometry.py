@@ -50,13 +50,13 @@ class OdometryOptions(Options):
 
     reach: Annotated[int, Range(1, 1000)] = 3
     """Frames are connected to the next one, failing that to the second next, and so on up to this many frames on."""
-    minimum_matches: Annotated[int, Range(4, 100_000)] = 15
+    min_matches: Annotated[int, Range(4, 100_000)] = 15
     """Minimum number of consistent matches that locate a frame."""
-    minimum_share: Annotated[float, SHARE] = 0.4
+    min_share: Annotated[float, SHARE] = 0.4
     """Minimum share (0 to 1) of the matches to a neighbour that must be consistent."""
     error_px: Annotated[float, Range(0.01, 1000)] = 4.0
     """Largest reprojection error of a consistent match, px."""
-    most_per_camera: Annotated[int, Range(4, 1_000_000)] = 200
+    max_per_camera: Annotated[int, Range(4, 1_000_000)] = 200
     """Maximum number of points of a frame that are searched for in a camera of another frame; those that most cameras
     saw come first."""
     unguided: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8))
@@ -193,7 +193,7 @@ def _sightings(
     for index, camera in enumerate(rig.names):
         if camera not in source or camera not in target:
             continue
-        known = _best_known(cloud, source[camera], camera, options.most_per_camera)
+        known = _best_known(cloud, source[camera], camera, options.max_per_camera)
         found = match_unguided(_subset(source[camera].features, known), target[camera].features, options.unguided)
         points.append(cloud.points[cloud.point_of[camera][known[found[:, 0]]]])
         pixels.append(target[camera].features.pixels[found[:, 1]])
@@ -240,7 +240,7 @@ def relative_pose(
 ) -> Edge:
     """Pose of the target frame relative to the frame of the point cloud."""
     points, pixels, cameras = _sightings(rig, cloud, source, target, options)
-    if len(points) < options.minimum_matches:
+    if len(points) < options.min_matches:
         return Edge(target_from_source=None, matches=len(points), sought=len(points))
     ransac = pycolmap.RANSACOptions(
         max_error=options.error_px, random_seed=seed, num_threads=1, min_num_trials=50, max_num_trials=3000
@@ -256,7 +256,7 @@ def relative_pose(
     if found is None:
         return Edge(target_from_source=None, matches=0, sought=len(points))
     pose, inliers = polish(rig, rigid_from_colmap(found["rig_from_world"]), points, pixels, cameras, options.error_px)
-    enough = inliers >= max(options.minimum_matches, options.minimum_share * len(points))
+    enough = inliers >= max(options.min_matches, options.min_share * len(points))
     return Edge(target_from_source=pose if enough else None, matches=inliers, sought=len(points))
 
 
@@ -292,9 +292,9 @@ def _reason(
     if fellows > 1:
         return f"with {fellows - 1} others in a part of the scan that nothing connects to the rest"
     most = max((edge.matches for pair, edge in edges.items() if frame in pair), default=0)
-    if most >= options.minimum_matches:
+    if most >= options.min_matches:
         return f"only {most} of its matches to its neighbours agree; too small a share"
-    return f"only {most} matches to its neighbours; {options.minimum_matches} are needed"
+    return f"only {most} matches to its neighbours; {options.min_matches} are needed"
 
 
 def chain(edges: Mapping[tuple[int, int], Edge], names: Sequence[str], options: OdometryOptions) -> Trajectory:

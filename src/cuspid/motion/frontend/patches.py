@@ -69,7 +69,7 @@ class PatchOptions(AlignmentOptions):
     """A patch is searched for in this many frames before and after its own."""
     turn_deg: Annotated[float, Range(0, 180)] = 40.0
     """Frames whose direction of view differs by more than this are skipped."""
-    minimum_views: Annotated[int, Range(2, 1000)] = 4
+    min_views: Annotated[int, Range(2, 1000)] = 4
     """Points that are found in fewer frames are left unchanged."""
 
 
@@ -375,7 +375,7 @@ class _Scene(NamedTuple):
             found += chain.from_iterable(map_in_threads(follow, zip(block, mine, strict=True)))
             progress("patches", block[-1] + 1, count)
         point, image_index, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
-        often = np.bincount(point, minlength=len(self.tracks.points))[point] >= self.options.minimum_views
+        often = np.bincount(point, minlength=len(self.tracks.points))[point] >= self.options.min_views
         return point[often], image_index[often], pixels[often]
 
 

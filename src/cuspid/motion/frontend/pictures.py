@@ -21,14 +21,14 @@ class Pictures:
 
     capture: Capture
     """The capture whose images are read."""
-    most_bytes: int = _BYTES
+    max_bytes: int = _BYTES
     """Memory for the images that are kept, in bytes."""
     _kept: dict[tuple[str, str], UInt8[np.ndarray, "h w"]] = field(default_factory=dict, init=False, repr=False)
 
     def image(self, frame: Frame, camera: str) -> Pixels:
         """As :meth:`cuspid.model.capture.Capture.fine_image`, with the same errors."""
         image = self.capture.fine_image(frame, camera)
-        if (len(self._kept) + 1) * image.shape[0] * image.shape[1] <= self.most_bytes:
+        if (len(self._kept) + 1) * image.shape[0] * image.shape[1] <= self.max_bytes:
             self._kept[frame.name, camera] = _grey(image)
         return image
 

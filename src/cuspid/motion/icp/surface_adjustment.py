@@ -54,7 +54,7 @@ def _shared_part(one: _Blocks, other: _Blocks) -> float:
 
 
 def neighbours(
-    surfaces: Sequence[Surface], poses: Sequence[Rigid3], least_overlap: float, distance_mm: float
+    surfaces: Sequence[Surface], poses: Sequence[Rigid3], min_overlap: float, distance_mm: float
 ) -> list[tuple[int, int]]:
     """Pairs of frames that share more than this part of the smaller surface, told by the blocks of space that it fills,
     in both orders.
@@ -67,7 +67,7 @@ def neighbours(
     shared = np.array([[_shared_part(one, other) for other in blocks] for one in blocks])
     np.fill_diagonal(shared, 0.0)
     through_third = np.array([np.minimum(one, shared).max(axis=1) for one in shared])
-    found = (shared > least_overlap) & (shared >= through_third)
+    found = (shared > min_overlap) & (shared >= through_third)
     return [(int(one), int(other)) for one, other in np.argwhere(found)]
 
 

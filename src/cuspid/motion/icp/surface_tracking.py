@@ -70,16 +70,16 @@ class SurfaceTrackingOptions(Options):
     border_px: Annotated[int, Range(0, 1000)] = 2
     """Depths within so many pixels of a depth map (in each direction) of one that is not known are not laid onto
     others: surfaces are smoothed from one side only there, and turn along with the cameras."""
-    minimum_overlap: Annotated[float, SHARE] = 0.3
+    min_overlap: Annotated[float, SHARE] = 0.3
     """Share (0 to 1) of a frame's surface that must lie on an earlier one for the frame to be placed."""
-    largest_scatter: Annotated[float, Range(0.0001, 1)] = 0.018
+    max_scatter: Annotated[float, Range(0.0001, 1)] = 0.018
     """Standard deviation of the distances between the surfaces of two frames, as a share of the working distance (0.09
     mm at 5 mm), above which they do not fit each other; less where less of the surface lies on the other one, in
     proportion."""
-    least_relief: Annotated[float, SHARE] = 0.003
+    min_relief: Annotated[float, SHARE] = 0.003
     """How much a surface must turn to hold another in place: least mean squared cosine between its normals and any
     direction; 0 is a plane, 1/3 a ball."""
-    minimum_located: Annotated[float, SHARE] = 0.5
+    min_located: Annotated[float, SHARE] = 0.5
     """Minimum share (0 to 1) of the frames that must be placed."""
     joint_overlap: Annotated[float, SHARE] = 0.15
     """Frames that share at least this part of the smaller surface are adjusted to each other, if neither shares more
@@ -133,9 +133,9 @@ def _doubt(step: _Step, overlap: float, options: SurfaceTrackingOptions, distanc
     if laid is None or laid.share < overlap:
         share = 0.0 if laid is None else laid.share
         return f"only {share:.0%} of its surface lies on that of an earlier frame"
-    if laid.sigma > laid.share * options.largest_scatter * distance_mm:
+    if laid.sigma > laid.share * options.max_scatter * distance_mm:
         return f"its surface scatters about that of earlier frames by {1000 * laid.sigma:.0f} um"
-    if laid.relief < options.least_relief:
+    if laid.relief < options.min_relief:
         return "its surface is too flat to be held in place by its shape"
     return None
 
@@ -167,7 +167,7 @@ def _track_frame(
     for number, earlier in enumerate(list(placed)[: -_BRIEFLY - 1 : -1]):
         starts = _starts(motion, distance_mm)
         step = _register_from_starts(surfaces, earlier, frame, starts, options, distance_mm)
-        doubt = _doubt(step, options.minimum_overlap, options, distance_mm)
+        doubt = _doubt(step, options.min_overlap, options, distance_mm)
         if doubt is None:
             return step.this_from_other @ placed[earlier], ""
         reason = doubt if number == 0 else reason
@@ -259,12 +259,12 @@ def _found_on(
     distance_mm: float,
 ) -> dict[int, Rigid3]:
     """The frames of a piece among those placed, if one of them is found there and the others bear it out."""
-    overlap = max(options.minimum_overlap, _FOUND_AGAIN)
+    overlap = max(options.min_overlap, _FOUND_AGAIN)
     few = {each: surfaces[each].some(_FEW, np.random.default_rng([options.seed, each])) for each in placed}
     for frame, pose in piece.items():
         for earlier in sorted(placed, key=lambda each: abs(each - frame)):
             tried = _register_icp(few[earlier], surfaces[frame], Rigid3.identity(), distance_mm)
-            if _doubt(tried, options.minimum_overlap, options, distance_mm) is not None:
+            if _doubt(tried, options.min_overlap, options, distance_mm) is not None:
                 continue
             step = _register_from_starts(surfaces, earlier, frame, [tried.this_from_other], options, distance_mm)
             if _doubt(step, overlap, options, distance_mm) is not None:
@@ -406,7 +406,7 @@ def _require_enough(
     placed: int, total: int, dropped: Sequence[Dropped], handpiece: Handpiece, options: SurfaceTrackingOptions
 ) -> None:
     """Raise ReconstructionError where too few frames are placed."""
-    if placed >= options.minimum_located * total and (placed > 1 or total == 1):
+    if placed >= options.min_located * total and (placed > 1 or total == 1):
         return
     shown = "; ".join(f"{each.what}: {each.reason}" for each in dropped[:3])
     polarisers = "cross polarisers (the handpiece file tells of none), " if glare_notes(handpiece) else ""

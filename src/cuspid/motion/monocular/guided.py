@@ -44,7 +44,7 @@ class GuidedOptions(Options):
     there are enough keypoints to match a wrong one farther away."""
     matching: MatchingOptions = field(default_factory=lambda: MatchingOptions(ratio=0.8, similarity=0.85))
     """Further criteria for a match."""
-    minimum_views: Annotated[int, Range(2, 1000)] = 4
+    min_views: Annotated[int, Range(2, 1000)] = 4
     """Tracks with fewer views are left out, except where a frame would lose all of its tracks."""
     start_px: Annotated[float, Range(0.01, 10_000)] = 12.0
     """Residual beyond which an observation is dropped before the first adjustment; half of it in later rounds."""
@@ -157,7 +157,7 @@ def _triangulate_tracks(
     colors[track[seen]] = np.concatenate([each.colors for each in features])[seen]
     good = _errors_px(model, points[track[seen]], frame, pixels) < limit_px
     views_of = np.bincount(track[seen][good], minlength=count)
-    good &= views_of[track[seen]] >= options.minimum_views
+    good &= views_of[track[seen]] >= options.min_views
     kept, point_index = np.unique(track[seen][good], return_inverse=True)
     tracks = Tracks(
         points=points[kept],

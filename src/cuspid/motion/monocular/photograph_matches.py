@@ -60,19 +60,19 @@ def detect_in_all(
     photographs: Sequence[Photograph],
     options: FeatureOptions,
     *,
-    largest_px: int,
+    max_image_px: int,
     even: bool,
     progress: Progress,
 ) -> tuple[dict[int, Features], list[Dropped]]:
     """Keypoints by index of the photograph, in its full size, and the photographs that cannot be read.
 
-    ``largest_px``: a longer side is reduced to it first. ``even``: with even local contrast.
+    ``max_image_px``: a longer side is reduced to it first. ``even``: with even local contrast.
     """
 
     def one(index: int) -> Features | Dropped:
         photograph = photographs[index]
         try:
-            return _detect(photograph, options, largest_px, even)
+            return _detect(photograph, options, max_image_px, even)
         except InputError as error:
             return Dropped(what=f"photograph {photograph.name}", reason=str(error))
 
@@ -81,10 +81,10 @@ def detect_in_all(
     return features, [each for each in found if isinstance(each, Dropped)]
 
 
-def _detect(photograph: Photograph, options: FeatureOptions, largest_px: int, even: bool) -> Features:
+def _detect(photograph: Photograph, options: FeatureOptions, max_image_px: int, even: bool) -> Features:
     image, mask = np.ascontiguousarray(photograph.pixels()[..., :3]), photograph.counts()
     size = np.array(photograph.size)
-    shrink = min(1.0, largest_px / float(size.max()))
+    shrink = min(1.0, max_image_px / float(size.max()))
     searched = np.maximum(np.rint(size * shrink), 1).astype(int)
     if shrink < 1:
         image = _resize(image, searched, cv2.INTER_AREA)

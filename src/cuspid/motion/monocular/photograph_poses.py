@@ -167,7 +167,9 @@ def _with_points(
         },
     )
     order = in_own_order(own)
-    features, _ = detect_in_all(order, options.features, largest_px=options.largest_px, even=False, progress=progress)
+    features, _ = detect_in_all(
+        order, options.features, max_image_px=options.max_image_px, even=False, progress=progress
+    )
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "first.db"
         match_all(own, order, features, database, options, plain=False, progress=progress)

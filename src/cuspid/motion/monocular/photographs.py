@@ -70,7 +70,7 @@ class PhotographOptions(Options):
     )
     """Keypoints of photographs with even local contrast, where too few were located by the others: plaster, enamel,
     varnish."""
-    largest_px: Annotated[int, Range(200, 100_000)] = 2400
+    max_image_px: Annotated[int, Range(200, 100_000)] = 2400
     """The longer side of larger photographs is reduced to this many px before keypoints are searched."""
     exhaustive: Annotated[int, Range(2, 10_000)] = 100
     """Up to so many photographs each is matched with every other, unless they are a film."""
@@ -80,7 +80,7 @@ class PhotographOptions(Options):
     """Ratio test of the matching."""
     plain_ratio: Annotated[float, Range(0.01, 1)] = 0.85
     """The same where too few were located."""
-    minimum_matches: Annotated[int, Range(8, 100_000)] = 15
+    min_matches: Annotated[int, Range(8, 100_000)] = 15
     """Minimum number of consistent matches of two photographs."""
     enough_share: Annotated[float, SHARE] = 0.9
     """Share (0 to 1) of the photographs that is enough not to try again, with keypoints for plain surfaces."""
@@ -160,7 +160,7 @@ def _attempt(
 ) -> _Attempt:
     started = time.perf_counter()
     how = options.plain_features if plain else options.features
-    features, unread = detect_in_all(order, how, largest_px=options.largest_px, even=plain, progress=progress)
+    features, unread = detect_in_all(order, how, max_image_px=options.max_image_px, even=plain, progress=progress)
     detected = time.perf_counter()
     database = folder / f"{'plain' if plain else 'first'}.db"
     pairs = match_all(photographs, order, features, database, options, plain=plain, progress=progress)
@@ -195,7 +195,7 @@ def match_all(
         seed=options.seed,
     )
     ratio = options.plain_ratio if plain else options.ratio
-    match_pairs(database, candidates, ratio=ratio, least=options.minimum_matches, seed=options.seed, progress=progress)
+    match_pairs(database, candidates, ratio=ratio, least=options.min_matches, seed=options.seed, progress=progress)
     return verified_pairs(database, features, order)
 
 
@@ -251,7 +251,7 @@ def _mapper_options(
     how = pycolmap.IncrementalPipelineOptions(
         random_seed=options.seed, num_threads=1, extract_colors=False, min_model_size=LEAST_PHOTOGRAPHS
     )
-    how.min_num_matches = options.minimum_matches
+    how.min_num_matches = options.min_matches
     numbered = enumerate(photographs.cameras.values(), start=1)
     how.constant_cameras = {number for number, known in numbered if known.calibrated is not None}
     how.mapper.constant_cameras = how.constant_cameras

@@ -92,9 +92,9 @@ class SingleOptions(Options):
     """Minimum number of consistent matches that show such a pair to be of the same place."""
     error_px: Annotated[float, Range(0.01, 1000)] = 2.0
     """Largest distance of a match from its epipolar line, px."""
-    minimum_matches: Annotated[int, Range(4, 100_000)] = 15
+    min_matches: Annotated[int, Range(4, 100_000)] = 15
     """Minimum number of consistent matches that verify a pair of frames, or locate a frame in the model."""
-    minimum_share: Annotated[float, SHARE] = 0.3
+    min_share: Annotated[float, SHARE] = 0.3
     """Minimum share (0 to 1) of the matches of two frames that must be consistent."""
     blurred_share: Annotated[float, SHARE] = 0.4
     """A frame with less than this share (0 to 1) of the sharpness of its neighbours is left out."""
@@ -216,15 +216,15 @@ def _verify(
     camera: pycolmap.Camera, one: Features, other: Features, matches: Int[np.ndarray, "k 2"], options: SingleOptions
 ) -> pycolmap.TwoViewGeometry | None:
     """Matches that agree with one relative motion, or None where there are too few."""
-    if len(matches) < options.minimum_matches:
+    if len(matches) < options.min_matches:
         return None
-    how = pycolmap.TwoViewGeometryOptions(min_num_inliers=options.minimum_matches)
+    how = pycolmap.TwoViewGeometryOptions(min_num_inliers=options.min_matches)
     how.ransac.max_error, how.ransac.random_seed = options.error_px, options.seed
     how.ransac.min_num_trials, how.ransac.max_num_trials = 30, 300
     found = pycolmap.estimate_calibrated_two_view_geometry(
         camera, one.pixels, camera, other.pixels, matches.astype(np.uint32), how
     )
-    least = max(options.minimum_matches, options.minimum_share * len(matches))
+    least = max(options.min_matches, options.min_share * len(matches))
     return found if len(found.inlier_matches) >= least else None
 
 
@@ -299,8 +299,8 @@ def _mapper_options(calibrated: bool, options: SingleOptions) -> pycolmap.Increm
     )
     how.ba_refine_focal_length = how.mapper.abs_pose_refine_focal_length = not calibrated
     how.ba_refine_extra_params = how.mapper.abs_pose_refine_extra_params = False
-    how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 2 * options.minimum_matches, 5.0
-    how.mapper.abs_pose_min_num_inliers = options.minimum_matches
+    how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 2 * options.min_matches, 5.0
+    how.mapper.abs_pose_min_num_inliers = options.min_matches
     how.mapper.abs_pose_max_error, how.mapper.abs_pose_min_inlier_ratio = 3 * options.error_px, 0.15
     how.mapper.filter_max_reproj_error = 1.5 * options.error_px
     how.ba_local_max_refinements, how.ba_global_max_refinements = 1, 2
@@ -480,7 +480,7 @@ def locate_single(
         models = max(models, wider, key=lambda each: each[0].num_reg_images() if each else 0)
     if not models:
         raise ReconstructionError(_why_nothing(sequence, kept, features, verified))
-    parts = _join_all([_model_of(model) for model in models], options.minimum_matches)
+    parts = _join_all([_model_of(model) for model in models], options.min_matches)
     first = _camera_of(models[0].cameras[1], sequence.camera, options)
     refined = [_refine_part(part, first, sequence, features, list(again), options, progress) for part in parts]
     return SingleMotion(
@@ -535,7 +535,7 @@ def refine_on_surface(
         return normalise_contrast(sequence.image(number[name]), options)
 
     followed = follow_points(part, read, options.patches, surface=surface, progress=progress)
-    if not hold_together(followed, len(part.frames), options.minimum_matches):
+    if not hold_together(followed, len(part.frames), options.min_matches):
         return None
     tracks = joined_tracks(_spanning(part.tracks, options.patches.reach), followed)
     try:

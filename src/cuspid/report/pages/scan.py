@@ -57,9 +57,9 @@ _THUMBNAIL_PX = 240
 class ReportOptions(Options):
     """What a page shows."""
 
-    most_faces: Annotated[int, Range(100, 10_000_000)] = 300_000
+    max_faces: Annotated[int, Range(100, 10_000_000)] = 300_000
     """Faces of the shown surface at most; a finer one is simplified, and the page says so."""
-    most_reference_faces: Annotated[int, Range(100, 10_000_000)] = 120_000
+    max_reference_faces: Annotated[int, Range(100, 10_000_000)] = 120_000
     """The same for the reference."""
     range_um: Annotated[float | None, Range(0.01, 100_000)] = None
     """Ends of the colour bar; default: the smallest of 5, 10, 25 ... that is at least 2.5 times the 95th percentile."""
@@ -83,7 +83,7 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
     scan = result.scan.transformed(shown_from_scan)
     range_um = options.range_um or deviation_range_um(result)
     worst = worst_places(scan, result.deviation_um, result.reference, options.worst)
-    shown = simplified(scan, options.most_faces)
+    shown = simplified(scan, options.max_faces)
     maps = [(scale, shown.carried(values)) for scale, values in surface_maps(result, range_um)]
     scene, sizes = _scene(result, shown, maps, shown_from_scan, options)
     return render_page(
@@ -136,7 +136,7 @@ def _scene(
     layers = [mesh_layer("scan", "Scan", shown.mesh, values_um={scale.name: values for scale, values in maps})]
     sizes = [_size("scan", shown.full_faces, len(shown.mesh.faces), shown.off_um)]
     if result.reference is not None:
-        truth = simplified(result.reference.mesh, options.most_reference_faces)
+        truth = simplified(result.reference.mesh, options.max_reference_faces)
         layers.append(
             mesh_layer("reference", "Reference", truth.mesh, visible=False, color=REFERENCE_COLOR, behind=True)
         )

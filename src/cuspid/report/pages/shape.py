@@ -22,10 +22,10 @@ _MM_PER_STEP = 0.001
 _LARGEST = 32767
 
 
-def shape_page(result: ShapeResult, most_faces: int = 120_000) -> str:
+def shape_page(result: ShapeResult, max_faces: int = 120_000) -> str:
     """The HTML of a shape model."""
     model = result.model
-    shown = simplified(model.mean.mesh, most_faces)
+    shown = simplified(model.mean.mesh, max_faces)
     count = min(_MOST_MODES, len(model.modes))
     shares = 100 * model.variance_shares
     scale = _scale(model)

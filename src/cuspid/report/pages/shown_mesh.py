@@ -43,12 +43,12 @@ class ShownMesh:
         return values[self.nearest]
 
 
-def simplified(mesh: Mesh, most_faces: int) -> ShownMesh:
-    """A mesh with at most ``most_faces`` faces."""
+def simplified(mesh: Mesh, max_faces: int) -> ShownMesh:
+    """A mesh with at most ``max_faces`` faces."""
     full = len(mesh.faces)
-    if full <= most_faces:
+    if full <= max_faces:
         return ShownMesh(mesh=mesh, nearest=np.arange(len(mesh.vertices)), full_faces=full, off_um=0.0)
-    shown = mesh.simplified(most_faces)
+    shown = mesh.simplified(max_faces)
     nearest = cKDTree(mesh.vertices).query(shown.vertices)[1]
     distances, _, _ = shown.closest(mesh.vertices[:: 1 + len(mesh.vertices) // _PROBES])
     return ShownMesh(

@@ -76,7 +76,7 @@ class ScanPathOptions(Options):
     """Standard deviation of the hand's rotation about each axis."""
     jitter_length_mm: Annotated[float, Range(0.01, 10_000)] = 6.0
     """Length of path over which the hand's drift changes."""
-    minimum_overlap: Annotated[float, Range(0, 0.99)] = 0.75
+    min_overlap: Annotated[float, Range(0, 0.99)] = 0.75
     """Minimum share (0 to 1) of the surface in the images of a frame that the next frame must also see, with the same
     cameras."""
     clearance_mm: Annotated[float, Range(0, 100)] = 0.5
@@ -141,7 +141,7 @@ class ScanPath:
         return tuple(np.array(list(self.rig_from_world))[self.travel_mm > self.steady.legs_end_mm].tolist())
 
     @property
-    def minimum_overlap(self) -> float:
+    def min_overlap(self) -> float:
         """Overlap of the frame that overlaps least with the next one, as the mean over its cameras."""
         return float(frame_overlap(self.overlap).min())
 
@@ -278,12 +278,12 @@ def _with_frames(
     frames = usual
     while True:
         path = _even_path(room, handpiece, steady, pose_at, frames)
-        if path.minimum_overlap >= options.minimum_overlap:
+        if path.min_overlap >= options.min_overlap:
             return path
         needed = _needed_frames(frames, path, options)
         shortfall = (
-            f"with {frames} frames, consecutive images overlap by only {path.minimum_overlap:.0%}, less than "
-            f"{options.minimum_overlap:.0%}"
+            f"with {frames} frames, consecutive images overlap by only {path.min_overlap:.0%}, less than "
+            f"{options.min_overlap:.0%}"
         )
         if options.frames:
             raise InputError(f"scan path: {shortfall}; raise --frames to about {needed} or shorten the path")
@@ -302,7 +302,7 @@ def _usual_frames(steady: SteadyPath, first: SteadyPath, options: ScanPathOption
 
 def _needed_frames(frames: int, path: ScanPath, options: ScanPathOptions) -> int:
     """Frames that are about enough: the surface that an image loses is in proportion to the step."""
-    growth = (1 - path.minimum_overlap) / (1 - options.minimum_overlap)
+    growth = (1 - path.min_overlap) / (1 - options.min_overlap)
     if len(path.steady.legs) > 1:
         # A single image on a turn is no reason for as many more everywhere.
         growth = min(growth, _GROWTH)

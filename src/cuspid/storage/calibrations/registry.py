@@ -47,7 +47,7 @@ class Format:
     read: Callable[[Mapping[str, Document], Hints], Calibration]
     write: Callable[[Mapping[str, MountedCamera], str], str | Mapping[str, str]] | None
     """Text of a file with a given suffix, or several by their name; lengths are in :attr:`unit`."""
-    most_cameras: int | None = None
+    max_cameras: int | None = None
     keeps_names: bool = True
 
 
@@ -74,11 +74,11 @@ FORMATS: Mapping[Name, Format] = {
     ),
     "ros": Format(
         title="ROS camera_info", unit="m", tells_unit=True, lenses=ros.LENSES, recognises=ros.recognises,
-        read=ros.read, write=ros.write, most_cameras=2,
+        read=ros.read, write=ros.write, max_cameras=2,
     ),
     "matlab": Format(
         title="MATLAB's stereoParameters", unit="mm", lenses=matlab.LENSES, recognises=matlab.recognises,
-        read=matlab.read, write=matlab.write, most_cameras=2, keeps_names=False,
+        read=matlab.read, write=matlab.write, max_cameras=2, keeps_names=False,
     ),
     "metashape": Format(
         title="Metashape's XML", unit="m", lenses=metashape.LENSES, recognises=metashape.recognises,
@@ -205,8 +205,8 @@ def carried_over(rig: Rig, kind: Name) -> CarriedOver:
     if format.write is None and kind != "handpiece":
         raise OutputError(f"{format.title} is only read; give another --to")
     count = len(rig.names)
-    if format.most_cameras is not None and count > format.most_cameras:
-        raise OutputError(f"{format.title} holds {format.most_cameras} cameras at most, not {count}; give another --to")
+    if format.max_cameras is not None and count > format.max_cameras:
+        raise OutputError(f"{format.title} holds {format.max_cameras} cameras at most, not {count}; give another --to")
     lenses = {name: carried(mounted.camera, format.lenses) for name, mounted in rig.cameras.items()}
     cameras = {name: replace(mounted, camera=lenses[name][0]) for name, mounted in rig.cameras.items()}
     notes = []

@@ -62,14 +62,14 @@ class StudyOptions(Options):
     precision: Precision = "pairs"
     """How repeats are compared: each pair, at places of the reference; each pair, mesh to mesh (slower); or each with
     their mean surface."""
-    farthest_mm: Annotated[float, Range(0.01, 100)] = 1.0
+    max_distance_mm: Annotated[float, Range(0.01, 100)] = 1.0
     """Surface farther than this from the other one is not shown by it; its share is told."""
     samples: Annotated[int, Range(1000, 5_000_000)] = 60_000
     """Samples on each scan, uniform by area."""
-    least_overlap: Annotated[float, SHARE] = 0.6
+    min_overlap: Annotated[float, SHARE] = 0.6
     """A scan is taken for one of another jaw where less than this share of the smaller surface comes to lie near the
     other one."""
-    least_share: Annotated[float, SHARE] = 0.5
+    min_share: Annotated[float, SHARE] = 0.5
     """A scan that shows less than this share of what any scan of its specimen shows is partial, and left out."""
     seed: Annotated[int, SEED] = 0
     """Of all random draws."""
@@ -105,7 +105,7 @@ def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> M
     points = pose.apply(samples)
     against = SignedDistance(aligned)
     sample_um, sample_place, piece = _onto_reference(points, specimen)
-    place_um = deviations_um(specimen.places, against, options.farthest_mm)
+    place_um = deviations_um(specimen.places, against, options.max_distance_mm)
     deformation = _deformation(specimen, against, place_um)
     stations = {**_pieces(points, sample_um, piece, specimen, deformation, options), **parts}
     return Measured(
@@ -158,9 +158,9 @@ def _register(mesh: Mesh, specimen: Specimen, options: StudyOptions) -> Alignmen
     found = _found_fast(mesh, surface, options.registration) or register(mesh, surface, options.registration, rng=rng)
     if found.mirrored:
         raise InputError("a mirror image of the reference; mirror it back, or give the reference of its own specimen")
-    if found.overlap < options.least_overlap:
+    if found.overlap < options.min_overlap:
         raise InputError(
-            f"at best {found.overlap:.0%} of it lies near the reference (--least-overlap {options.least_overlap:g}); "
+            f"at best {found.overlap:.0%} of it lies near the reference (--min-overlap {options.min_overlap:g}); "
             f"it seems to show something else than specimen {specimen.name}"
         )
     return found
@@ -291,7 +291,7 @@ def _pieces(
 ) -> Parts:
     """Teeth, or stations along the arch, as rigid parts of a scan that its modes are taken out of: a bend within a part
     would shift its rigid fit."""
-    used = (np.abs(sample_um) < 1000 * options.farthest_mm) & (piece != GUM)
+    used = (np.abs(sample_um) < 1000 * options.max_distance_mm) & (piece != GUM)
     places = {each: specimen.places.points[specimen.piece == each] for each in specimen.pieces}
     centroids = {each: at.mean(axis=0) for each, at in places.items() if len(at) >= _LEAST_PIECE}
     curve = specimen.arch_curve

@@ -230,7 +230,7 @@ def _made_from(
 ) -> tuple[str, str]:
     """The digest of a scan's file, and what identifies what is kept of it."""
     # What is decided later, from what is kept, changes nothing of it.
-    later = ("region", "precision", "least_share")
+    later = ("region", "precision", "min_share")
     settings = {name: value for name, value in vars(options).items() if name not in later}
     return digests[scan.key], storage.digest_of(
         [digests[scan.key], specimens[scan.specimen], to_plain(settings), code_version(*CODE)]

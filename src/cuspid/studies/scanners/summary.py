@@ -103,8 +103,8 @@ def find_common(specimen: Specimen, scans: Sequence[ScanFile], folder: Path, opt
     kept, remarks = [], []
     for scan in scans:
         share = float(shown[scan.key].sum() / most)
-        if share < options.least_share:
-            why = f"shows {share:.0%} of what the median scan of its specimen shows (--least-share); left out"
+        if share < options.min_share:
+            why = f"shows {share:.0%} of what the median scan of its specimen shows (--min-share); left out"
             remarks.append(Remark(what=scan.name, why=why, left_out=True))
         else:
             kept.append(scan)
@@ -186,7 +186,7 @@ def compared(scan: ScanFile, folder: Path, specimen: Specimen, common: Common, o
         place_um = place_um + changes
         sample_um = sample_um + np.where(measured.sample_place == BEYOND, 0, changes[measured.sample_place])
     over = (measured.sample_place != BEYOND) & common.places[measured.sample_place]
-    near = np.abs(sample_um) <= 1000 * options.farthest_mm
+    near = np.abs(sample_um) <= 1000 * options.max_distance_mm
     return Compared(
         scan=scan,
         measured=measured,
@@ -350,7 +350,7 @@ def _mesh_to_mesh(one: Compared, other: Compared, specimen: Specimen, options: S
         align=options.align != "none",
         registration=options.registration,
         samples=options.samples,
-        farthest_mm=options.farthest_mm,
+        max_distance_mm=options.max_distance_mm,
     )
     first, second = (_aligned_mesh(each, specimen) for each in (one, other))
     found = compare_pair(first, second, pairs, rng=np.random.default_rng([options.seed, 2]))

@@ -51,13 +51,13 @@ def methods(options: StudyOptions, summary: Mapping[str, Any]) -> str:
         lines.append("The fit was made anew on the surface that all scans of a specimen show.")
     lines.append(
         f"{_REGIONS[options.region]} was evaluated, at 60000 places of the reference and {options.samples} samples of "
-        f"each scan, uniform by area (seed {options.seed}); surface farther than {options.farthest_mm:g} mm from the "
-        "other one counted as not shown. Deviations are signed closest-point distances, positive outside the "
+        f"each scan, uniform by area (seed {options.seed}); surface farther than {options.max_distance_mm:g} mm from "
+        "the other one counted as not shown. Deviations are signed closest-point distances, positive outside the "
         "reference; figures without a prefix are from scan to reference."
     )
     lines.append(
-        f"Scans with less than {options.least_overlap:.0%} overlap were taken for other specimens, and those that show "
-        f"less than {options.least_share:.0%} of what the median scan shows for partial ones; both were left out and "
+        f"Scans with less than {options.min_overlap:.0%} overlap were taken for other specimens, and those that show "
+        f"less than {options.min_share:.0%} of what the median scan shows for partial ones; both were left out and "
         "are listed."
     )
     lines.append(
