@@ -260,7 +260,7 @@ def test_a_rig_that_touches_or_is_too_dense_is_told(section: Section) -> None:
 
 
 def test_the_search_improves_over_the_thesis_and_can_be_repeated(section: Section) -> None:
-    brief = brief_of(cameras=CamerasBrief(most=6))
+    brief = brief_of(cameras=CamerasBrief(max=6))
     first, second = (optimise_handpiece(brief, [section], 14.0, QUICK) for _ in range(2))
     thesis = build_handpiece(first.best.layout, Shape(), brief.sensor, brief.depth_range_mm)
     assert first.best.assessment.cost < assessed(thesis, section, brief).cost - 0.01
@@ -276,7 +276,7 @@ def test_the_search_improves_over_the_thesis_and_can_be_repeated(section: Sectio
 
 
 def test_a_brief_that_no_rig_meets_names_the_condition(section: Section) -> None:
-    brief = brief_of(surfaces={"buccal": 0.99}, cameras=CamerasBrief(most=4), mouth=MouthBrief(clearance_mm=0.3))
+    brief = brief_of(surfaces={"buccal": 0.99}, cameras=CamerasBrief(max=4), mouth=MouthBrief(clearance_mm=0.3))
     design = optimise_handpiece(brief, [section], 14.0, QUICK)
     assert len(design.handpiece.rig.names) <= 4
     with pytest.raises(InputError, match=r"no handpiece with at most 4 cameras .* share of buccal: 0.*wanted >= 0.99"):
@@ -284,7 +284,7 @@ def test_a_brief_that_no_rig_meets_names_the_condition(section: Section) -> None
 
 
 def test_a_brief_that_is_met_passes(section: Section) -> None:
-    brief = brief_of(surfaces={"occlusal": 0.5}, cameras=CamerasBrief(most=4))
+    brief = brief_of(surfaces={"occlusal": 0.5}, cameras=CamerasBrief(max=4))
     design = optimise_handpiece(brief, [section], 14.0, replace(QUICK, samples=0))
     design.check(brief)
     assert design.best.assessment.unmet == ()

@@ -285,7 +285,7 @@ def test_keypoints_outside_of_masks_are_not_used(folder, tmp_path):
     features, _ = detect_in_all(
         found.photographs[:2],
         PhotographOptions().features,
-        largest_px=2400,
+        max_image_px=2400,
         even=False,
         progress=lambda *_: None,
     )

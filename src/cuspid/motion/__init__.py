@@ -1,4 +1,4 @@
-"""Where the handpiece was: features, lean pairs, odometry, one bundle adjustment. The only import of pycolmap."""
+"""Where the handpiece was: features, lean pairs, odometry, one bundle adjustment. Only this package knows pycolmap."""
 
 from cuspid.runtime.signals import handlers_kept
 

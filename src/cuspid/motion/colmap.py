@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pycolmap
@@ -34,6 +34,8 @@ from cuspid.runtime.inputs import read_bytes
 from cuspid.storage.calibrations.lenses import ALL, carried
 from cuspid.storage.files import digest_of, hash_file, whole_files
 
+ColmapModel: TypeAlias = pycolmap.Reconstruction
+"""COLMAP's sparse model."""
 MODEL_FILES = ("cameras", "images", "points3D")
 """Files of a sparse model, ``.bin`` or ``.txt``; newer ones also have ``rigs`` and ``frames``."""
 
@@ -69,6 +71,31 @@ def rigid_from_colmap(transform: pycolmap.Rigid3d) -> Rigid3:
     return Rigid3.from_matrix(np.asarray(transform.matrix()))
 
 
+def find_rig_pose(
+    rig: Rig,
+    points: Float[np.ndarray, "n 3"],
+    pixels: Float[np.ndarray, "n 2"],
+    cameras: Int[np.ndarray, "n"],
+    *,
+    error_px: float,
+    seed: int,
+) -> Rigid3 | None:
+    """rig_from_world by RANSAC and refinement (generalised absolute pose), from points and where the cameras, by their
+    index in the rig, see them; None where nothing agrees."""
+    ransac = pycolmap.RANSACOptions(
+        max_error=error_px, random_seed=seed, num_threads=1, min_num_trials=50, max_num_trials=3000
+    )
+    found = pycolmap.estimate_and_refine_generalized_absolute_pose(
+        pixels,
+        points,
+        cameras.tolist(),
+        [colmap_rigid(mounted.cam_from_rig) for mounted in rig.cameras.values()],
+        [colmap_camera(mounted.camera) for mounted in rig.cameras.values()],
+        ransac,
+    )
+    return None if found is None else rigid_from_colmap(found["rig_from_world"])
+
+
 # --- writing -----------------------------------------------------------------------------------------------------
 
 
@@ -87,7 +114,7 @@ def _colmap_rig(rig: Rig) -> pycolmap.Rig:
 
 
 def _add_images(
-    model: pycolmap.Reconstruction, found: Reconstruction, taken: Mapping[str, Sequence[str]], suffix: str
+    model: ColmapModel, found: Reconstruction, taken: Mapping[str, Sequence[str]], suffix: str
 ) -> Int[np.ndarray, "o"]:
     """Add frames and images with their keypoints; returns the number of each observation within its image."""
     cameras, tracks = found.rig.names, found.tracks
@@ -118,7 +145,7 @@ def _add_images(
     return within
 
 
-def _add_points(model: pycolmap.Reconstruction, tracks: Tracks, cameras: int, within: Int[np.ndarray, "o"]) -> None:
+def _add_points(model: ColmapModel, tracks: Tracks, cameras: int, within: Int[np.ndarray, "o"]) -> None:
     """Add the points with their tracks."""
     order = np.argsort(tracks.point_index, kind="stable")
     image = (tracks.frame_index * cameras + tracks.camera_index + 1)[order].tolist()
@@ -130,16 +157,14 @@ def _add_points(model: pycolmap.Reconstruction, tracks: Tracks, cameras: int, wi
             model.add_point3D(tracks.points[point], pycolmap.Track(elements), tracks.colors[point])
 
 
-def to_colmap(
-    found: Reconstruction, frames: Sequence[Frame] | None = None, suffix: str = ".png"
-) -> pycolmap.Reconstruction:
+def to_colmap(found: Reconstruction, frames: Sequence[Frame] | None = None, suffix: str = ".png") -> ColmapModel:
     """The reconstruction as COLMAP's, with one rig; its observations become the images' keypoints.
 
     ``frames`` specify which cameras have an image of each located frame; None: all of them.
     """
     every = dict.fromkeys(found.frames, found.rig.names)
     taken = every if frames is None else {frame.name: frame.cameras for frame in frames}
-    model = pycolmap.Reconstruction()
+    model = ColmapModel()
     for index, mounted in enumerate(found.rig.cameras.values()):
         model.add_camera(colmap_camera(mounted.camera, index + 1))
     model.add_rig(_colmap_rig(found.rig))
@@ -257,7 +282,7 @@ def _is_whole(data: bytes, after: Callable[[bytes, int], int]) -> bool:
     return at == len(data)
 
 
-def _read_checked_model(folder: Path) -> pycolmap.Reconstruction:
+def _read_checked_model(folder: Path) -> ColmapModel:
     """A model from disk. Raises InputError, also for truncated files, on which COLMAP's own reader may hang."""
     folder = _model_folder(folder)
     for name, after in _AFTER.items():
@@ -265,12 +290,12 @@ def _read_checked_model(folder: Path) -> pycolmap.Reconstruction:
         if file.is_file() and not _is_whole(read_bytes(file, "arrays"), after):
             raise InputError(f"{file}: truncated or damaged; copy the COLMAP model again")
     try:
-        return pycolmap.Reconstruction(folder)
+        return ColmapModel(folder)
     except (RuntimeError, ValueError, IndexError, MemoryError, KeyError, OverflowError) as error:
         raise InputError(f"{folder}: the COLMAP model cannot be read; copy or export it again") from error
 
 
-def read_sparse(folder: Path) -> pycolmap.Reconstruction:
+def read_sparse(folder: Path) -> ColmapModel:
     """A model from disk, which may lack ``points3D``: cameras and images are enough. Raises InputError."""
     for candidate in (folder, folder / "0", folder / "sparse", folder / "sparse" / "0"):
         for suffix, empty in ((".bin", bytes(8)), (".txt", b"# none\n")):
@@ -300,7 +325,7 @@ def hash_sparse(folder: Path) -> str:
     return ""
 
 
-def _match_names(model: pycolmap.Reconstruction, capture: Capture, source: str) -> _PosedImages:
+def _match_names(model: ColmapModel, capture: Capture, source: str) -> _PosedImages:
     """Registered images by frame and camera. Raises InputError where the names are not those of the capture."""
     frames, cameras = {frame.name for frame in capture.frames}, set(capture.handpiece.rig.names)
     poses, identifiers, strange = {}, {}, []
@@ -356,7 +381,7 @@ def _rig_pose(rig: Rig, poses: Mapping[str, Rigid3], scale: float) -> Rigid3:
 
 
 def _tracks(
-    model: pycolmap.Reconstruction,
+    model: ColmapModel,
     images: _PosedImages,
     frames: Sequence[str],
     cameras: Sequence[str],
@@ -385,7 +410,7 @@ def _tracks(
     )
 
 
-def from_colmap(model: pycolmap.Reconstruction, capture: Capture, source: str) -> Reconstruction:
+def from_colmap(model: ColmapModel, capture: Capture, source: str) -> Reconstruction:
     """Metric poses of a capture from a COLMAP model made with or without the rig; the rig's baselines set the scale.
 
     The log contains ``mm_per_model_unit`` and ``scale_spread``, from which a caller can judge whether the model fits
@@ -478,9 +503,7 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def _map(
-    capture: Capture, folder: Path, with_rig: bool, seed: int
-) -> tuple[list[pycolmap.Reconstruction], list[float]]:
+def _map(capture: Capture, folder: Path, with_rig: bool, seed: int) -> tuple[list[ColmapModel], list[float]]:
     """COLMAP's models of the capture and the seconds of extraction, matching and mapping."""
     if not isinstance(capture.source, ImageFolder):
         raise InputError("COLMAP reads images from a folder: write the capture to one, or use --motion rig")

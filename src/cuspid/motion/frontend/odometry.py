@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import breadth_first_order
 
@@ -22,7 +21,7 @@ from cuspid.model.camera import stack_lenses
 from cuspid.model.capture import Dropped
 from cuspid.model.rig import Handpiece, Rig
 from cuspid.motion.bundle.normal_equations import pose_equations
-from cuspid.motion.colmap import colmap_camera, colmap_rigid, rigid_from_colmap
+from cuspid.motion.colmap import find_rig_pose
 from cuspid.motion.frontend.features import Features, spread
 from cuspid.motion.frontend.pairs import IndexedFeatures, MatchingOptions, match_guided, match_unguided
 from cuspid.motion.frontend.tracks import intersect_rays, join
@@ -242,20 +241,10 @@ def relative_pose(
     points, pixels, cameras = _sightings(rig, cloud, source, target, options)
     if len(points) < options.min_matches:
         return Edge(target_from_source=None, matches=len(points), sought=len(points))
-    ransac = pycolmap.RANSACOptions(
-        max_error=options.error_px, random_seed=seed, num_threads=1, min_num_trials=50, max_num_trials=3000
-    )
-    found = pycolmap.estimate_and_refine_generalized_absolute_pose(
-        pixels,
-        points,
-        cameras.tolist(),
-        [colmap_rigid(mounted.cam_from_rig) for mounted in rig.cameras.values()],
-        [colmap_camera(mounted.camera) for mounted in rig.cameras.values()],
-        ransac,
-    )
+    found = find_rig_pose(rig, points, pixels, cameras, error_px=options.error_px, seed=seed)
     if found is None:
         return Edge(target_from_source=None, matches=0, sought=len(points))
-    pose, inliers = polish(rig, rigid_from_colmap(found["rig_from_world"]), points, pixels, cameras, options.error_px)
+    pose, inliers = polish(rig, found, points, pixels, cameras, options.error_px)
     enough = inliers >= max(options.min_matches, options.min_share * len(points))
     return Edge(target_from_source=pose if enough else None, matches=inliers, sought=len(points))
 

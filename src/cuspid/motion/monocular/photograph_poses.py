@@ -16,21 +16,13 @@ import pycolmap
 
 from cuspid.model.camera import Camera
 from cuspid.model.capture import Dropped
-from cuspid.model.photographs import PhotoCamera, Photograph, Photographs
+from cuspid.model.photographs import PhotoCamera, Photographs
 from cuspid.model.reconstruction import Tracks
 from cuspid.model.sparse_model import PhotoModel
-from cuspid.motion.colmap import colmap_camera, colmap_rigid, quiet, read_sparse, rigid_from_colmap
-from cuspid.motion.frontend.features import Features
-from cuspid.motion.monocular.photograph_matches import camera_of, detect_in_all, image_name
-from cuspid.motion.monocular.photographs import (
-    PhotographOptions,
-    adjusted_rms,
-    check_enough,
-    from_first,
-    in_own_order,
-    match_all,
-    photo_model,
-)
+from cuspid.motion.colmap import ColmapModel, quiet, read_sparse, rigid_from_colmap
+from cuspid.motion.monocular.mapping import adjusted_rms, camera_of, from_first, photo_model, triangulate
+from cuspid.motion.monocular.photograph_matches import detect_in_all
+from cuspid.motion.monocular.photographs import PhotographOptions, check_enough, in_own_order, match_all
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.progress import Progress, silent
 
@@ -67,7 +59,7 @@ def take_photograph_poses(
     )
 
 
-def _by_name(model: pycolmap.Reconstruction, photographs: Photographs, folder: Path) -> dict[str, pycolmap.Image]:
+def _by_name(model: ColmapModel, photographs: Photographs, folder: Path) -> dict[str, pycolmap.Image]:
     """The images of the model that are among the photographs. Raises InputError where none is."""
     names = {name.lower(): name for name in photographs.names}
     found = {}
@@ -86,7 +78,7 @@ def _by_name(model: pycolmap.Reconstruction, photographs: Photographs, folder: P
 
 
 def _take_model(
-    model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image], photographs: Photographs, folder: Path
+    model: ColmapModel, images: Mapping[str, pycolmap.Image], photographs: Photographs, folder: Path
 ) -> PhotoModel:
     """Poses, lenses, and the points that the model has. Photographs of one size may have several of its cameras."""
     keys = {name: (photographs[name].camera, image.camera_id) for name, image in images.items()}
@@ -117,7 +109,7 @@ def _to_size(camera: pycolmap.Camera, photographs: Photographs, name: str, folde
 
 
 def _tracks(
-    model: pycolmap.Reconstruction,
+    model: ColmapModel,
     images: Mapping[str, pycolmap.Image],
     photographs: Photographs,
     cameras: Sequence[str],
@@ -173,30 +165,5 @@ def _with_points(
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "first.db"
         match_all(own, order, features, database, options, plain=False, progress=progress)
-        posed = _build(known, order, features)
-        how = pycolmap.IncrementalPipelineOptions(random_seed=options.seed, num_threads=1, extract_colors=False)
-        found = pycolmap.triangulate_points(posed, database, folder, folder, True, how)
+        found = triangulate(known, order, features, database, options.seed)
     return replace(photo_model(own, order, found, features), reprojection_rms_px=adjusted_rms(found))
-
-
-def _build(known: PhotoModel, order: Sequence[Photograph], features: Mapping[int, Features]) -> pycolmap.Reconstruction:
-    """The poses as COLMAP's model without points, numbered as in the database."""
-    model, names = pycolmap.Reconstruction(), list(known.cameras)
-    for number, camera in enumerate(known.cameras.values(), start=1):
-        made = colmap_camera(camera, number)
-        model.add_camera(made)
-        rig = pycolmap.Rig(rig_id=number)
-        rig.add_ref_sensor(made.sensor_id)
-        model.add_rig(rig)
-    for index, found in features.items():
-        name = order[index].name
-        number = names.index(known.camera_of[name]) + 1
-        image = pycolmap.Image(image_name(index), found.pixels, number, index + 1)
-        frame = pycolmap.Frame(frame_id=index + 1, rig_id=number)
-        frame.add_data_id(image.data_id)
-        frame.rig_from_world = colmap_rigid(known.cam_from_world[name])
-        model.add_frame(frame)
-        image.frame_id = index + 1
-        model.add_image(image)
-        model.register_frame(index + 1)
-    return model

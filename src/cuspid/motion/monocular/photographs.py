@@ -11,49 +11,41 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 
-from cuspid.geometry import Rigid3
-from cuspid.model.camera import Camera
 from cuspid.model.capture import Dropped
 from cuspid.model.photographs import Photograph, Photographs
-from cuspid.model.reconstruction import Tracks
 from cuspid.model.sparse_model import PhotoModel
-from cuspid.motion.colmap import quiet, rigid_from_colmap
+from cuspid.motion.colmap import ColmapModel, quiet
 from cuspid.motion.frontend.features import FeatureOptions, Features
-from cuspid.motion.monocular.photograph_matches import (
-    Pair,
-    camera_of,
-    candidate_pairs,
-    detect_in_all,
+from cuspid.motion.monocular.mapping import (
+    LEAST_PHOTOGRAPHS,
+    calibrated_cameras,
     fill_database,
+    focal_shares,
+    guess_focal_lengths,
+    map_photographs,
     match_pairs,
-    verified_pairs,
-    with_focal_lengths,
+    model_size,
+    photo_model,
+    placed_images,
+    read_verified_pairs,
+    refine_lens,
 )
+from cuspid.motion.monocular.photograph_matches import Pair, candidate_pairs, detect_in_all
 from cuspid.runtime.errors import InputError, ReconstructionError
 from cuspid.runtime.options import SEED, SHARE, Options, Range
 from cuspid.runtime.progress import Progress, silent
 
-LEAST_PHOTOGRAPHS = 3
-"""Two tell no more than a direction from each other."""
 _OTHER_FOCALS: tuple[dict[int, float], ...] = ({0: 1.2}, {0: 2.4}, {0: 0.75})
 """Of the longer side: where COLMAP's guess (1.2) leads nowhere, a tele and a wide-angle lens; 0 is any camera."""
-_TELLING = 5
-"""A model of so many photographs tells a focal length."""
 _STILL_PAIRS = 0.5
 """Where more than this share of the pairs show the same at the same place, the camera stood still."""
-_LENS_GAIN = 0.03
-"""Share of the RMS error that a further lens parameter must take away, not to be left at zero."""
-_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
-"""COLMAP's models of a lens, each with all parameters of the one before it."""
-_MANY_PER_CAMERA = 8
-_LOSS_PX, _WORST_SIGMAS, _LEAST_PX = 1.0, 4.0, 1.0
 _NARROW_DEG = 2.0
 
 
@@ -139,14 +131,14 @@ class _Attempt:
     features: Mapping[int, Features]
     unread: Sequence[Dropped]
     pairs: Sequence[Pair]
-    models: Sequence[pycolmap.Reconstruction]
+    models: Sequence[ColmapModel]
     """Largest first."""
     seconds: Mapping[str, float]
 
     @property
     def located(self) -> int:
         """Number of photographs in the largest model."""
-        return int(self.models[0].num_reg_images()) if self.models else 0
+        return len(placed_images(self.models[0])) if self.models else 0
 
 
 def _attempt(
@@ -195,8 +187,10 @@ def match_all(
         seed=options.seed,
     )
     ratio = options.plain_ratio if plain else options.ratio
-    match_pairs(database, candidates, ratio=ratio, least=options.min_matches, seed=options.seed, progress=progress)
-    return verified_pairs(database, features, order)
+    match_pairs(
+        database, candidates, ratio=ratio, min_matches=options.min_matches, seed=options.seed, progress=progress
+    )
+    return read_verified_pairs(database, features, order)
 
 
 def _models(
@@ -208,34 +202,29 @@ def _models(
     *,
     plain: bool,
     progress: Progress,
-) -> list[pycolmap.Reconstruction]:
+) -> list[ColmapModel]:
     """COLMAP's models, largest first. Where the first does not locate all, once more with fewer matches, from the focal
     length that it found, or from other guesses where it found none."""
     if not pairs or stood_still(pairs):
         return []
-    models = _map(photographs, database, count, options, loose=plain, progress=progress)
-    found = _focal_shares(models)
+    attempt = partial(
+        map_photographs,
+        photographs,
+        database,
+        count,
+        min_matches=options.min_matches,
+        seed=options.seed,
+        progress=progress,
+    )
+    models = attempt(loose=plain)
+    found = focal_shares(models)
     told = all(each.calibrated is not None or each.focal_px is not None for each in photographs.cameras.values())
     for focal_share in (found,) if found or told else _OTHER_FOCALS:
-        if models and models[0].num_reg_images() == count:
+        if models and len(placed_images(models[0])) == count:
             break
-        with_focal_lengths(database, photographs, focal_share)
-        others = _map(photographs, database, count, options, loose=True, progress=progress)
-        models = max(models, others, key=lambda each: _size(each[0]) if each else (0, 0))
+        guess_focal_lengths(database, photographs, focal_share)
+        models = max(models, attempt(loose=True), key=lambda each: model_size(each[0]) if each else (0, 0))
     return models
-
-
-def _focal_shares(models: Sequence[pycolmap.Reconstruction]) -> dict[int, float]:
-    """Focal lengths that a model of several photographs has found, by number of the camera, as shares of the longer
-    side."""
-    if not models or models[0].num_reg_images() < _TELLING:
-        return {}
-    cameras = models[0].cameras.items()
-    return {number: float(camera.params[0]) / max(camera.width, camera.height) for number, camera in cameras}
-
-
-def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
-    return int(model.num_reg_images()), int(model.compute_num_observations())
 
 
 def stood_still(pairs: Sequence[Pair]) -> bool:
@@ -243,117 +232,12 @@ def stood_still(pairs: Sequence[Pair]) -> bool:
     return bool(pairs) and sum(pair.is_still for pair in pairs) > _STILL_PAIRS * len(pairs)
 
 
-def _mapper_options(
-    photographs: Photographs, options: PhotographOptions, loose: bool
-) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's defaults, repeatable; calibrated cameras are held."""
-    # Threads would add in another order in each run, and bundle adjustment makes much of that.
-    how = pycolmap.IncrementalPipelineOptions(
-        random_seed=options.seed, num_threads=1, extract_colors=False, min_model_size=LEAST_PHOTOGRAPHS
-    )
-    how.min_num_matches = options.min_matches
-    numbered = enumerate(photographs.cameras.values(), start=1)
-    how.constant_cameras = {number for number, known in numbered if known.calibrated is not None}
-    how.mapper.constant_cameras = how.constant_cameras
-    if loose or len(photographs.names) < 2 * LEAST_PHOTOGRAPHS:
-        how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 40, 6.0
-        how.mapper.abs_pose_min_num_inliers, how.mapper.abs_pose_min_inlier_ratio = 15, 0.15
-    return how
-
-
-def _map(
-    photographs: Photographs,
-    database: Path,
-    count: int,
-    options: PhotographOptions,
-    *,
-    loose: bool,
-    progress: Progress,
-) -> list[pycolmap.Reconstruction]:
-    placed = 0
-
-    def tell() -> None:
-        nonlocal placed
-        placed = min(placed + 1, count)
-        progress("mapping", placed, count)
-
-    with tempfile.TemporaryDirectory(dir=database.parent) as folder:
-        how = _mapper_options(photographs, options, loose)
-        models = pycolmap.incremental_mapping(database, folder, folder, how, next_image_callback=tell)
-    progress("mapping", count, count)
-    return sorted(models.values(), key=_size, reverse=True)
-
-
-# --- the lens ----------------------------------------------------------------------------------------------------
-
-
-def refined(model: pycolmap.Reconstruction, held: frozenset[int]) -> tuple[pycolmap.Reconstruction, float]:
-    """A model adjusted with as many parameters of the lens as its photographs bear, without what does not fit, and its
-    RMS reprojection error, px.
-
-    A parameter more must pay: one that the images do not determine turns with the poses. The principal point stays in
-    the middle: it can hardly be told from a turn of the camera, above all in a ring of photographs.
-    """
-    rms = _adjust_model(model, held)
-    by_camera = dict.fromkeys(model.cameras, 0)
-    for identifier in model.reg_image_ids():
-        by_camera[model.images[identifier].camera_id] += 1
-    free = {number for number, count in by_camera.items() if number not in held and count >= _MANY_PER_CAMERA}
-    for kind in _MODELS[1:] if free else ():
-        wider = pycolmap.Reconstruction(model)
-        for number in free:
-            _widen(wider.cameras[number], kind)
-        better = _adjust_model(wider, held)
-        if better < (1 - _LENS_GAIN) * rms:
-            model, rms = wider, better
-    return model, rms
-
-
-def _widen(camera: pycolmap.Camera, kind: str) -> None:
-    """The same lens with more parameters."""
-    wide = camera_of(camera, "camera")
-    chosen = {"RADIAL": [0, 2, 3, 4, 5], "OPENCV": list(range(8))}[kind]
-    camera.model = getattr(pycolmap.CameraModelId, kind)
-    camera.params = wide.parameters[chosen].tolist()
-
-
-def _adjust_model(model: pycolmap.Reconstruction, held: frozenset[int]) -> float:
-    """Adjust all, twice, without what does not fit after the first time; RMS, px."""
-    for _ in range(2):
-        config = pycolmap.BundleAdjustmentConfig()
-        for identifier in model.reg_image_ids():
-            config.add_image(identifier)
-        for number in held:
-            config.set_constant_cam_intrinsics(number)
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        how = pycolmap.BundleAdjustmentOptions(print_summary=False)
-        how.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-        how.ceres.loss_function_scale = _LOSS_PX
-        how.ceres.solver_options.num_threads = 1
-        pycolmap.create_default_bundle_adjuster(how, config, model).solve()
-        model.update_point_3d_errors()
-        errors = np.array([point.error for point in model.points3D.values()])
-        most = max(_WORST_SIGMAS * float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0, _LEAST_PX)
-        manager = pycolmap.ObservationManager(model)
-        manager.filter_all_points3D(most, 1.5)
-    return adjusted_rms(model)
-
-
-def adjusted_rms(model: pycolmap.Reconstruction) -> float:
-    """RMS reprojection error, px."""
-    model.update_point_3d_errors()
-    lengths = np.array([point.track.length() for point in model.points3D.values()], dtype=np.float64)
-    errors = np.array([point.error for point in model.points3D.values()])
-    return float(np.sqrt(np.sum(lengths * errors**2) / max(lengths.sum(), 1)))
-
-
 # --- models as values --------------------------------------------------------------------------------------------
 
 
 def _to_sparse_model(photographs: Photographs, order: Sequence[Photograph], found: _Attempt) -> PhotoModel:
-    numbered = enumerate(photographs.cameras.values(), start=1)
-    held = frozenset(number for number, known in numbered if known.calibrated is not None)
-    model, rms = refined(found.models[0], held & set(found.models[0].cameras))
+    held = calibrated_cameras(photographs) & set(found.models[0].cameras)
+    model, rms = refine_lens(found.models[0], held)
     noun = photo_model(photographs, order, model, found.features)
     dropped = (*photographs.left_out, *found.unread, *_unlocated_reasons(order, found))
     counts = {"models": len(found.models), "pairs": len(found.pairs), "points": len(noun.tracks.points)}
@@ -366,79 +250,12 @@ def _to_sparse_model(photographs: Photographs, order: Sequence[Photograph], foun
     )
 
 
-def photo_model(
-    photographs: Photographs,
-    order: Sequence[Photograph],
-    model: pycolmap.Reconstruction,
-    features: Mapping[int, Features],
-) -> PhotoModel:
-    """A model of COLMAP's, whose image k + 1 is photograph k of ``order``, as the noun."""
-    by_name = {order[identifier - 1].name: identifier for identifier in model.reg_image_ids()}
-    names = [name for name in photographs.names if name in by_name]
-    poses = {name: rigid_from_colmap(model.images[by_name[name]].cam_from_world()) for name in names}
-    used = {number: name for number, name in enumerate(photographs.cameras, start=1) if number in model.cameras}
-    cameras = {name: camera_of(model.cameras[number], name) for number, name in used.items()}
-    camera_names = {name: photographs[name].camera for name in names}
-    cameras = {name: camera for name, camera in cameras.items() if name in camera_names.values()}
-    known = PhotoModel(
-        cameras={name: _keep_calibration(photographs, name, camera) for name, camera in cameras.items()},
-        camera_of=camera_names,
-        cam_from_world=poses,
-        tracks=_tracks(model, [by_name[name] for name in names], list(cameras), camera_names, names, features),
-    )
-    return from_first(known)
-
-
-def _keep_calibration(photographs: Photographs, name: str, camera: Camera) -> Camera:
-    """A given calibration as it was given, with its covariance."""
-    return photographs.cameras[name].calibrated or camera
-
-
-def _tracks(
-    model: pycolmap.Reconstruction,
-    identifiers: Sequence[int],
-    cameras: Sequence[str],
-    camera_names: Mapping[str, str],
-    names: Sequence[str],
-    features: Mapping[int, Features],
-) -> Tracks:
-    place = {identifier: frame for frame, identifier in enumerate(identifiers)}
-    points: list[np.ndarray] = []
-    colors, rows, pixels = [], [], []
-    for _, point in sorted(model.points3D.items()):
-        seen = [each for each in point.track.elements if each.image_id in place]
-        rows += [(len(points), place[each.image_id]) for each in seen]
-        pixels += [features[each.image_id - 1].pixels[each.point2D_idx] for each in seen]
-        colors.append(np.mean([features[e.image_id - 1].colors[e.point2D_idx] for e in seen], axis=0))
-        points.append(point.xyz)
-    index = np.array(rows, dtype=np.int64).reshape(-1, 2)
-    camera_index = np.array([cameras.index(camera_names[name]) for name in names], dtype=np.int64)
-    return Tracks(
-        points=np.array(points, dtype=np.float64).reshape(-1, 3),
-        colors=np.rint(np.array(colors).reshape(-1, 3)).astype(np.uint8),
-        point_index=index[:, 0],
-        frame_index=index[:, 1],
-        camera_index=camera_index[index[:, 1]],
-        pixels=np.array(pixels, dtype=np.float64).reshape(-1, 2),
-    )
-
-
-def from_first(model: PhotoModel) -> PhotoModel:
-    """The same in the frame of the first located photograph."""
-    first = next(iter(model.cam_from_world.values()))
-    world_from_first = first.inverse()
-    poses = {name: pose @ world_from_first for name, pose in model.cam_from_world.items()}
-    identity = {model.frames[0]: Rigid3.identity()}
-    tracks = replace(model.tracks, points=first.apply(model.tracks.points))
-    return replace(model, cam_from_world={**poses, **identity}, tracks=tracks)
-
-
 # --- what to tell ------------------------------------------------------------------------------------------------
 
 
 def _unlocated_reasons(order: Sequence[Photograph], found: _Attempt) -> list[Dropped]:
     """The photographs that are not in the largest model, and why not."""
-    placed, *others = ({int(identifier) - 1 for identifier in model.reg_image_ids()} for model in found.models)
+    placed, *others = (set(placed_images(model)) for model in found.models)
     dropped = []
     for index in sorted(set(found.features) - placed, key=lambda each: order[each].name):
         partners = sum(index in (pair.first, pair.second) for pair in found.pairs)
@@ -455,7 +272,7 @@ def _unlocated_reasons(order: Sequence[Photograph], found: _Attempt) -> list[Dro
 
 def _notes(photographs: Photographs, model: PhotoModel, found: _Attempt) -> list[str]:
     notes = []
-    placed, *others = (set(each.reg_image_ids()) for each in found.models)
+    placed, *others = (set(placed_images(each)) for each in found.models)
     apart = [len(other) for other in others if not other <= placed]
     if apart:
         notes.append(

@@ -7,15 +7,12 @@ not millimetres.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Annotated
 
 import cv2
 import numpy as np
-import pycolmap
 from jaxtyping import Float, Int, UInt8
 
 from cuspid.geometry import Rigid3, best_similarity
@@ -26,13 +23,20 @@ from cuspid.model.panorama import FrameUse
 from cuspid.model.reconstruction import Tracks, chosen_tracks, joined_tracks
 from cuspid.model.sparse_model import SparseModel
 from cuspid.motion.bundle.adjustment import adjust_model
-from cuspid.motion.colmap import quiet, rigid_from_colmap
 from cuspid.motion.frontend.features import FeatureOptions, Features, detect
 from cuspid.motion.frontend.pairs import MatchingOptions, match_unguided
 from cuspid.motion.frontend.patches import PatchOptions, follow_points, hold_together, lengthen
 from cuspid.motion.frontend.revisits import look_alike
 from cuspid.motion.frontend.tracks import first_and_last
 from cuspid.motion.monocular.guided import GuidedOptions, refine
+from cuspid.motion.monocular.mapping import (
+    FilmCamera,
+    FilmModel,
+    VerifiedPair,
+    build_film_camera,
+    map_film,
+    verify_matches,
+)
 from cuspid.runtime.errors import ReconstructionError
 from cuspid.runtime.options import SEED, SHARE, Options, Range
 from cuspid.runtime.progress import Progress, silent
@@ -199,48 +203,28 @@ Pairs = Mapping[tuple[int, int], Int[np.ndarray, "_ 2"]]
 """Consistent matches (keypoints) by indices of frames."""
 
 
-def _colmap_camera(camera: Camera | None, size: tuple[int, int], options: SingleOptions) -> pycolmap.Camera:
-    """The calibrated camera, or one with a guessed focal length."""
-    width, height = size
-    if camera is None:
-        focal = Camera.from_field_of_view(width, height, options.field_of_view_deg).focal_px[0]
-        parameters = [focal, width / 2, height / 2]
-        return pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=width, height=height, params=parameters)
-    parameters = camera.parameters.tolist()
-    return pycolmap.Camera(
-        camera_id=1, model=camera.model, width=width, height=height, params=parameters, has_prior_focal_length=True
-    )
-
-
-def _verify(
-    camera: pycolmap.Camera, one: Features, other: Features, matches: Int[np.ndarray, "k 2"], options: SingleOptions
-) -> pycolmap.TwoViewGeometry | None:
-    """Matches that agree with one relative motion, or None where there are too few."""
-    if len(matches) < options.min_matches:
-        return None
-    how = pycolmap.TwoViewGeometryOptions(min_num_inliers=options.min_matches)
-    how.ransac.max_error, how.ransac.random_seed = options.error_px, options.seed
-    how.ransac.min_num_trials, how.ransac.max_num_trials = 30, 300
-    found = pycolmap.estimate_calibrated_two_view_geometry(
-        camera, one.pixels, camera, other.pixels, matches.astype(np.uint32), how
-    )
-    least = max(options.min_matches, options.min_share * len(matches))
-    return found if len(found.inlier_matches) >= least else None
-
-
 def _verified_pairs(
     features: Mapping[int, Features],
     pairs: Sequence[tuple[int, int]],
-    camera: pycolmap.Camera,
+    camera: FilmCamera,
     matching: MatchingOptions,
     options: SingleOptions,
     progress: Progress,
-) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+) -> dict[tuple[int, int], VerifiedPair]:
     """Verified matches of pairs of frames; pairs that have too few are not in it."""
 
-    def verified(pair: tuple[int, int]) -> pycolmap.TwoViewGeometry | None:
+    def verified(pair: tuple[int, int]) -> VerifiedPair | None:
         one, other = (features[index] for index in pair)
-        return _verify(camera, one, other, match_unguided(one, other, matching), options)
+        return verify_matches(
+            camera,
+            one,
+            other,
+            match_unguided(one, other, matching),
+            error_px=options.error_px,
+            min_matches=options.min_matches,
+            min_share=options.min_share,
+            seed=options.seed,
+        )
 
     found = map_in_threads(verified, pairs, stage="matching", progress=progress)
     return {pair: geometry for pair, geometry in zip(pairs, found, strict=True) if geometry is not None}
@@ -249,10 +233,10 @@ def _verified_pairs(
 def _revisits(
     features: Mapping[int, Features],
     kept: Sequence[int],
-    camera: pycolmap.Camera,
+    camera: FilmCamera,
     options: SingleOptions,
     progress: Progress,
-) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+) -> dict[tuple[int, int], VerifiedPair]:
     """Verified matches of frames that show a place again."""
     alike = look_alike([features[index] for index in kept], options.revisit_frames, options.seed)
     pairs = [(kept[one], kept[other]) for one, other in alike]
@@ -265,106 +249,32 @@ def _pairs_at(kept: Sequence[int], steps: Sequence[int]) -> list[tuple[int, int]
     return [(kept[i], kept[i + step]) for i in range(len(kept)) for step in steps if i + step < len(kept)]
 
 
-# --- mapping -----------------------------------------------------------------------------------------------------
-
-
-def _fill_database(
-    path: Path,
-    camera: pycolmap.Camera,
-    features: Mapping[int, Features],
-    verified: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
-) -> None:
-    """A COLMAP database with keypoints and verified matches; frame i is image i + 1."""
-    with pycolmap.Database.open(path) as database:
-        database.write_camera(camera, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(camera.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
-        for index, found in features.items():
-            image = pycolmap.Image(f"{index:06d}", found.pixels, 1, index + 1)
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=index + 1, rig_id=1)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(index + 1, found.pixels.astype(np.float32))
-        for (one, other), geometry in verified.items():
-            database.write_two_view_geometry(one + 1, other + 1, geometry)
-
-
-def _mapper_options(calibrated: bool, options: SingleOptions) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's mapper for short steps over a low relief, with few and noisy matches."""
-    # Threads would add in another order in each run, and bundle adjustment makes much of that.
-    how = pycolmap.IncrementalPipelineOptions(
-        random_seed=options.seed, num_threads=1, extract_colors=False, min_model_size=3
-    )
-    how.ba_refine_focal_length = how.mapper.abs_pose_refine_focal_length = not calibrated
-    how.ba_refine_extra_params = how.mapper.abs_pose_refine_extra_params = False
-    how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 2 * options.min_matches, 5.0
-    how.mapper.abs_pose_min_num_inliers = options.min_matches
-    how.mapper.abs_pose_max_error, how.mapper.abs_pose_min_inlier_ratio = 3 * options.error_px, 0.15
-    how.mapper.filter_max_reproj_error = 1.5 * options.error_px
-    how.ba_local_max_refinements, how.ba_global_max_refinements = 1, 2
-    how.ba_global_frames_ratio, how.ba_global_points_ratio = 1.3, 1.4
-    return how
-
-
 def _map(
-    camera: pycolmap.Camera,
+    camera: FilmCamera,
     features: Mapping[int, Features],
-    verified: Mapping[tuple[int, int], pycolmap.TwoViewGeometry],
-    calibrated: bool,
+    verified: Mapping[tuple[int, int], VerifiedPair],
+    sequence: ImageSequence,
     options: SingleOptions,
     progress: Progress,
-) -> list[pycolmap.Reconstruction]:
-    """COLMAP's models, largest first."""
-    placed = 0
-
-    def count() -> None:
-        nonlocal placed
-        placed = min(placed + 1, len(features))
-        progress("mapping", placed, len(features))
-
-    with tempfile.TemporaryDirectory() as folder, quiet():
-        database = Path(folder) / "database.db"
-        _fill_database(database, camera, features, verified)
-        models = pycolmap.incremental_mapping(
-            database,
-            folder,
-            Path(folder) / "sparse",
-            _mapper_options(calibrated, options),
-            next_image_callback=count,
-        )
-    progress("mapping", len(features), len(features))
-    return sorted(models.values(), key=lambda model: -int(model.num_reg_images()))
+) -> list[FilmModel]:
+    if not verified:
+        return []
+    return map_film(
+        camera,
+        features,
+        verified,
+        calibrated=sequence.camera is not None,
+        min_matches=options.min_matches,
+        error_px=options.error_px,
+        seed=options.seed,
+        progress=progress,
+    )
 
 
 # --- models as values --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Model:
-    """A model while it is joined with others: poses by index of frame, points, and rows (point, frame, keypoint)."""
-
-    poses: Mapping[int, Rigid3]
-    points: Float[np.ndarray, "p 3"]
-    seen: Int[np.ndarray, "o 3"]
-
-
-def _model_of(found: pycolmap.Reconstruction) -> _Model:
-    images = {identifier: found.images[identifier] for identifier in sorted(found.reg_image_ids())}
-    points: list[np.ndarray] = []
-    rows: list[tuple[int, int, int]] = []
-    for _, point in sorted(found.points3D.items()):
-        rows += [(len(points), each.image_id - 1, each.point2D_idx) for each in point.track.elements]
-        points.append(point.xyz)
-    return _Model(
-        {identifier - 1: rigid_from_colmap(image.cam_from_world()) for identifier, image in images.items()},
-        np.array(points, dtype=np.float64).reshape(-1, 3),
-        np.array(rows, dtype=np.int64).reshape(-1, 3),
-    )
-
-
-def _same_points(one: _Model, other: _Model) -> Int[np.ndarray, "k 2"]:
+def _same_points(one: FilmModel, other: FilmModel) -> Int[np.ndarray, "k 2"]:
     """Points of two models that were seen as the same keypoint."""
     where = {(frame, keypoint): point for point, frame, keypoint in one.seen.tolist()}
     pairs = {
@@ -373,7 +283,7 @@ def _same_points(one: _Model, other: _Model) -> Int[np.ndarray, "k 2"]:
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
-def _join_models(one: _Model, other: _Model, least: int) -> _Model | None:
+def _join_models(one: FilmModel, other: FilmModel, least: int) -> FilmModel | None:
     """Both models in the frame of the first, joined by the points that they share; None where those do not agree."""
     same = _same_points(one, other)
     for _ in range(3):
@@ -389,12 +299,12 @@ def _join_models(one: _Model, other: _Model, least: int) -> _Model | None:
     moved = scale * other.points @ rotation.T + shift
     fresh = other.seen[~np.isin(other.seen[:, 1], list(one.poses))]
     seen = np.concatenate([one.seen, fresh + [len(one.points), 0, 0]])
-    return _Model({**poses, **one.poses}, np.concatenate([one.points, moved]), seen)
+    return FilmModel({**poses, **one.poses}, np.concatenate([one.points, moved]), seen, one.focal_px)
 
 
-def _join_all(models: Sequence[_Model], least: int) -> list[_Model]:
+def _join_all(models: Sequence[FilmModel], least: int) -> list[FilmModel]:
     """Models joined as long as any two share enough points; frames of a smaller one that a larger one has are its."""
-    parts: list[_Model] = []
+    parts: list[FilmModel] = []
     for model in models:
         for index, part in enumerate(parts):
             joined = _join_models(part, model, least)
@@ -407,7 +317,7 @@ def _join_all(models: Sequence[_Model], least: int) -> list[_Model]:
 
 
 def _to_sparse_model(
-    model: _Model, camera: Camera, names: Sequence[str], features: Mapping[int, Features]
+    model: FilmModel, camera: Camera, names: Sequence[str], features: Mapping[int, Features]
 ) -> SparseModel:
     """A model as the noun; points that fewer than two frames still see are left out."""
     order = sorted(model.poses)
@@ -431,18 +341,18 @@ def _to_sparse_model(
     )
 
 
-def _camera_of(found: pycolmap.Camera, given: Camera | None, options: SingleOptions) -> Camera:
+def _start_camera(focal_px: float, sequence: ImageSequence, options: SingleOptions) -> Camera:
     """The given calibration, or the focal length that the mapper found, free to be refined."""
-    if given is not None:
-        return given
-    focal, *centre = found.params
+    if sequence.camera is not None:
+        return sequence.camera
+    width, height = sequence.size
     covariance = np.zeros((8, 8))
-    covariance[:2, :2] = (options.focal_share * focal) ** 2
+    covariance[:2, :2] = (options.focal_share * focal_px) ** 2
     return Camera(
-        width=found.width,
-        height=found.height,
-        focal_px=np.array([focal, focal]),
-        principal_point_px=np.array(centre),
+        width=width,
+        height=height,
+        focal_px=np.array([focal_px, focal_px]),
+        principal_point_px=np.array([width / 2, height / 2]),
         covariance=covariance,
     )
 
@@ -466,22 +376,21 @@ def locate_single(
     kept = [index for index in range(len(names)) if index not in refused]
     _check_enough(kept, refused, names)
     features = {index: looks[index].features for index in kept}
-    camera = _colmap_camera(sequence.camera, sequence.size, options)
+    camera = build_film_camera(sequence.camera, sequence.size, options.field_of_view_deg)
     verified = _verified_pairs(features, _pairs_at(kept, options.steps), camera, options.matching, options, progress)
     again = _revisits(features, kept, camera, options, progress)
     verified |= again
-    calibrated = sequence.camera is not None
-    models = _map(camera, features, verified, calibrated, options, progress) if verified else []
-    if not models or models[0].num_reg_images() < len(kept):
+    models = _map(camera, features, verified, sequence, options, progress)
+    if not models or len(models[0].poses) < len(kept):
         looser = replace(options.matching, ratio=options.bridge_ratio)
         bridges = _verified_pairs(features, _pairs_at(kept, options.bridge_steps), camera, looser, options, progress)
         verified = {**bridges, **verified}
-        wider = _map(camera, features, verified, calibrated, options, progress) if verified else []
-        models = max(models, wider, key=lambda each: each[0].num_reg_images() if each else 0)
+        wider = _map(camera, features, verified, sequence, options, progress)
+        models = max(models, wider, key=lambda each: len(each[0].poses) if each else 0)
     if not models:
         raise ReconstructionError(_why_nothing(sequence, kept, features, verified))
-    parts = _join_all([_model_of(model) for model in models], options.min_matches)
-    first = _camera_of(models[0].cameras[1], sequence.camera, options)
+    parts = _join_all(models, options.min_matches)
+    first = _start_camera(models[0].focal_px, sequence, options)
     refined = [_refine_part(part, first, sequence, features, list(again), options, progress) for part in parts]
     return SingleMotion(
         parts=tuple(refined),
@@ -489,13 +398,13 @@ def locate_single(
         notes=(
             *_strangers(looks, names),
             *_seen_again(list(again), names),
-            *_notes(refined[0].camera, calibrated, refined),
+            *_notes(refined[0].camera, sequence.camera is not None, refined),
         ),
     )
 
 
 def _refine_part(
-    part: _Model,
+    part: FilmModel,
     camera: Camera,
     sequence: ImageSequence,
     features: Mapping[int, Features],
