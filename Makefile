@@ -38,7 +38,7 @@ format: $(STAMP)
 docs: $(STAMP).docs
 	$(BIN)/python benchmarks/quoted.py --check
 	$(BIN)/sphinx-build --quiet --fail-on-warning --doctree-dir build/doctrees docs build/docs
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m documentation tests/test_docs.py tests/test_examples.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m documentation tests/whole/test_docs.py tests/whole/test_examples.py
 	@echo "build/docs/index.html"
 
 # As users get it: in an environment of its own, far from the sources.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import hashlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -127,3 +128,53 @@ def make_capture(
             storage.write_image(image_path(capture, stem, name), rng.integers(0, 255, (12, 16, 3), dtype=np.uint8))
     storage.write_capture(folder, capture)
     return capture
+
+
+Images = Mapping[tuple[str, str], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class InMemory:
+    """Images by (frame, camera). An :class:`cuspid.model.capture.ImageSource`."""
+
+    images: Images
+    suffix: str = ".png"
+
+    def read(self, frame: str, camera: str) -> np.ndarray:
+        return self.images[frame, camera]
+
+    def size(self, frame: str, camera: str) -> tuple[int, int]:
+        height, width = self.images[frame, camera].shape[:2]
+        return width, height
+
+    def mask(self, frame: str, camera: str) -> np.ndarray | None:
+        return None
+
+    def digest(self, frame: str, camera: str) -> str:
+        return hashlib.sha256(self.images[frame, camera].tobytes()).hexdigest()
+
+    def where(self, frame: str, camera: str) -> str:
+        return f"{camera} of {frame}"
+
+
+def times(handpiece: Handpiece, factor: float) -> Handpiece:
+    """The handpiece with all lengths multiplied."""
+    cameras = {
+        name: replace(
+            mounted,
+            cam_from_rig=Rigid3(mounted.cam_from_rig.rotation, factor * mounted.cam_from_rig.translation),
+            covariance=None if mounted.covariance is None else mounted.covariance * np.outer(*[_units(factor)] * 2),
+        )
+        for name, mounted in handpiece.rig.cameras.items()
+    }
+    near, far = handpiece.depth_range_mm
+    return replace(
+        handpiece,
+        rig=Rig(cameras),
+        working_distance_mm=factor * handpiece.working_distance_mm,
+        depth_range_mm=(factor * near, factor * far),
+    )
+
+
+def _units(factor: float) -> np.ndarray:
+    return np.repeat([1.0, factor], 3)

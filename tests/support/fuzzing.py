@@ -32,6 +32,7 @@ from PIL import Image
 import photo_scene
 from boards import photographs, scene, undistorted
 from builders import image_path, write_frames
+from colmap_models import make_capture, make_found, without_rig, write_colmap
 from cuspid import cli, storage
 from cuspid.anatomy.jaw_files import Labelling, load_jaw
 from cuspid.anatomy.phantom.build import build_phantom
@@ -56,6 +57,15 @@ from cuspid.runtime.image_files import image_size, read_fine, read_image
 from cuspid.studies.grid import Case, Work
 from cuspid.studies.scanners.files import find_files
 from cuspid.studies.scanners.specimen import load_specimen
+from panoramas import (
+    known_film,
+    picture,
+    small_panorama,
+    stitched_panorama,
+    write_calibration,
+    write_stitched,
+    write_truth,
+)
 from report_folders import (
     TOOTH,
     write_calibrated,
@@ -65,12 +75,6 @@ from report_folders import (
     write_score,
     write_shape,
 )
-from test_cli_stitch import picture, write_calibration
-from test_colmap import make_capture, make_found, without_rig, write
-from test_panorama import small_panorama
-from test_panorama_evaluation import known_film, write_truth
-from test_rescaling import panorama as stitched_panorama
-from test_rescaling import write as write_stitched
 
 LONGEST_S = 10.0
 """Of work; waiting may take more on a busy machine."""
@@ -265,7 +269,7 @@ def _colmap(folder: Path) -> None:
         for frame in capture.frames:
             storage.write_image(image_path(capture, frame.name, name), black)
     storage.write_capture(folder / "capture", capture)
-    write(without_rig(found), folder / "model")
+    write_colmap(without_rig(found), folder / "model")
 
 
 def _shape(folder: Path) -> None:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
+from builders import InMemory
 from cuspid.geometry import Rigid3
 from cuspid.model.capture import Capture, Frame
 from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
+from cuspid.model.reconstruction import DepthMap
 from cuspid.model.rig import Handpiece, Light, Lighting, Sensor
+from cuspid.mvs.matching import StereoOptions
 from cuspid.simulation.appearance import APPEARANCES
 from cuspid.simulation.raycast import Scene, auto_gain, render_image
-from synthetic_scene import diamond, height_field
-from test_any_rig import InMemory
+from synthetic_scene import cast_depth, diamond, height_field
 
 SIZE_PX = 160
 HILLS = height_field(lambda x, y: 5 + 0.4 * np.sin(1.8 * x) * np.cos(1.5 * y), half_width_mm=7.0)
@@ -66,3 +68,21 @@ def plain_scan() -> Capture:
     """Four frames over plain hills."""
     handpiece = lit()
     return capture_of(handpiece, photographs(handpiece, WAY))
+
+
+OPTIONS = StereoOptions(spacing_px=4)
+
+
+def of_one_frame(images: Mapping[tuple[str, str], np.ndarray]) -> dict[str, np.ndarray]:
+    return {camera: image for (frame, camera), image in images.items() if frame == "00000"}
+
+
+def errors_um(maps: Sequence[DepthMap]) -> np.ndarray:
+    """All errors of known depths; the world is the rig frame."""
+    off = [1000 * (each.depth_mm - cast_depth(HILLS, each.camera, each.cam_from_rig))[each.known] for each in maps]
+    return np.concatenate(off)
+
+
+def white(handpiece: Handpiece) -> Handpiece:
+    lights = {name: replace(light, colour=np.ones(3)) for name, light in handpiece.lights.items()}
+    return replace(handpiece, lights=lights)
