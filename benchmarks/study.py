@@ -406,6 +406,7 @@ def speed(jaws: Path, work: Path) -> dict[str, Any]:
         "all_processes_gib": most_kib / 2**20,
         "cores": len(os.sched_getaffinity(0)),
         "load": os.getloadavg()[1],
+        "commit": conditions()["commit"],
     }
 
 
