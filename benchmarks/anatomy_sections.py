@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 from cuspid_thesis.catalogue import TABLE_3_2
-from cuspid_thesis.results import at
+from cuspid_thesis.results import value_at
 
 Result = Mapping[str, Any]
 
@@ -60,7 +60,7 @@ def prepared(results: Sequence[Result]) -> str:
     rows = []
     for row in TABLE_3_2:
         if row.result in by_case:
-            found = at(by_case[row.result], row.path)
+            found = value_at(by_case[row.result], row.path)
             ours = (found["min_um"], found["max_um"], found["mean_abs_um"], found["std_abs_um"], found["p95_um"])
             printed = "/".join(f"{value:g}" for value in (row.min_um, row.max_um, row.mean_um, row.std_um))
             rows.append((f"{row.part}, {row.what}", row.tooth or "all", printed, *(f"{figure:.1f}" for figure in ours)))

@@ -33,7 +33,7 @@ from cuspid.studies.camera_pair import (
     study_camera_pair,
     table,
 )
-from cuspid.studies.matching_noise import MatchingNoiseOptions, MatchingSamples, binned, fit_noise, sample_matching
+from cuspid.studies.matching_noise import MatchingNoiseOptions, MatchingSamples, bin_samples, fit_noise, sample_matching
 
 EDGE_MM = 0.3
 EDGES = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.3)
@@ -49,7 +49,7 @@ def matching(jaw: Jaw, pictures: Path) -> dict[str, object]:
     """Bins, fits and their check for each matcher, and a picture."""
     fitted = sample_matching(jaw, FITTED, np.random.default_rng(0))
     checked = sample_matching(jaw, CHECKED, np.random.default_rng(1))
-    bins = {str(name): binned(samples, EDGES) for name, samples in fitted.items()}
+    bins = {str(name): bin_samples(samples, EDGES) for name, samples in fitted.items()}
     laws = {str(name): (law.noise.sigma_px, law.noise.deformation or np.inf) for name, law in MATCHING.items()}
     save_noise_picture(
         pictures / "camera-pair-noise.png",
@@ -68,7 +68,7 @@ def matching(jaw: Jaw, pictures: Path) -> dict[str, object]:
             "held_doubling": laws[name][1],
             "check": against_law(checked[name], laws[name]),
             "bins": rows,
-            "by_convergence": binned(fitted[name], (0, 8, 15, 28, 40, 50), "convergence_deg"),
+            "by_convergence": bin_samples(fitted[name], (0, 8, 15, 28, 40, 50), "convergence_deg"),
         }
     return found
 
@@ -76,7 +76,7 @@ def matching(jaw: Jaw, pictures: Path) -> dict[str, object]:
 def against_law(samples: MatchingSamples, law: tuple[float, float]) -> list[dict[str, float]]:
     """Measured over expected noise of samples that the law was not fitted to, by bins."""
     sigma_px, doubling = law
-    rows = [row for row in binned(samples, EDGES) if row["matched_pct"] >= FITTED_SHARE_PCT]
+    rows = [row for row in bin_samples(samples, EDGES) if row["matched_pct"] >= FITTED_SHARE_PCT]
     expected = [sigma_px * float(np.hypot(1, (row["low"] + row["high"]) / 2 / doubling)) for row in rows]
     return [
         {"low": row["low"], "high": row["high"], "measured_over_law": row["sigma_px"] / value}

@@ -32,7 +32,7 @@ from cuspid.model.rig import Sensor
 from cuspid.storage import write_jaw, write_json, write_poses
 from cuspid.storage.files import whole_file
 from cuspid.storage.handpieces import camera_to_json, rigid_to_json
-from cuspid_thesis.scan_cases import timed
+from cuspid_thesis.scan_cases import run_program
 
 HERE = Path(__file__).parent
 BOARD = Board(square_mm=4.96)
@@ -89,7 +89,7 @@ def reconstruct(folder: Path, timeout_s: float) -> dict[str, Any]:
     command = [sys.executable, "-m", "cuspid", "reconstruct", str(folder / "photos"), "--out", str(folder / "out")]
     log = folder / "log.txt"
     with log.open("wb") as stream:
-        status, took = timed("timeout", "-k", "20", str(timeout_s), *command, *board, log=stream)
+        status, took = run_program("timeout", "-k", "20", str(timeout_s), *command, *board, log=stream)
     return {**told(status, log.read_bytes()), **took}
 
 

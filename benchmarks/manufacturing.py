@@ -37,7 +37,7 @@ from cuspid.model.reconstruction import Reconstruction
 from cuspid.model.rig import Rig
 from cuspid.pipeline import scan as pipeline
 from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
-from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
+from cuspid.simulation.manufacturing import ManufacturingOptions, sample_built, with_tolerances
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.storage import write_json
 from cuspid.studies.grid import Case, Value, run_grid
@@ -58,7 +58,7 @@ def judge(*, tolerances: str, seed: int, scan: Path, held: bool) -> dict[str, Va
     """The figures of one handpiece: the images are those of the drawn one, the file is that of one that was built."""
     capture = storage.read_capture(scan / "capture")
     manufacturing = replace(TOLERANCES[tolerances], manufacturing_seed=seed)
-    off = told(built(capture.handpiece, manufacturing), manufacturing)
+    off = with_tolerances(sample_built(capture.handpiece, manufacturing), manufacturing)
     exact = tolerances == "none"
     figures: dict[str, Value] = {"commit": commit()}
     with tempfile.TemporaryDirectory(prefix="cuspid-built-") as folder:

@@ -31,7 +31,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from run import conditions, run_timed, timed
+from run import conditions, run_program, run_timed
 
 from cuspid import storage
 from cuspid.anatomy.jaw_files import jaw_files, load_jaw
@@ -127,7 +127,7 @@ def measure(name: str, method: str, folder: Path, limit_s: int) -> dict[str, obj
     """Stitch a film by a method through its command line, and evaluate the panorama."""
     out, filmed = folder / method, folder / film_of(method)
     command = METHODS[method](filmed / "capture", out, limit_s)
-    status, figures = timed(*command)
+    status, figures = run_program(*command)
     score, failure = None, given_up(status, limit_s) if status else unmade(out)
     if failure is None:
         made = out if (out / "panorama.json").exists() else first_part(out)

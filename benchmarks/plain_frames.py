@@ -30,7 +30,7 @@ from cuspid.model.capture import Capture
 from cuspid.model.mesh import Mesh
 from cuspid.model.pairing import rank_sources
 from cuspid.model.rig import Handpiece
-from cuspid.motion.icp.surface_tracking import SurfaceTrackingOptions, adjusted
+from cuspid.motion.icp.surface_tracking import SurfaceTrackingOptions, adjust_poses
 from cuspid.motion.icp.surfaces import Surface, surface_of
 from cuspid.mvs.initial_depth import initial_pairs, semi_global
 from cuspid.mvs.matching import DepthEstimator
@@ -142,7 +142,7 @@ def steps(surfaces: list[Surface], poses: list[Rigid3], distance_mm: float) -> d
     options, twists = SurfaceTrackingOptions(), []
     for k in range(len(poses) - 1):
         true = poses[k + 1] @ poses[k].inverse()
-        (first, second), *_ = adjusted(surfaces[k : k + 2], poses[k : k + 2], options, distance_mm, silent)
+        (first, second), *_ = adjust_poses(surfaces[k : k + 2], poses[k : k + 2], options, distance_mm, silent)
         off = second @ first.inverse() @ true.inverse()
         twists.append(1000 * np.concatenate([off.rotation_vector, off.translation]))
     mean, error = np.mean(twists, axis=0), np.std(twists, axis=0, ddof=1) / np.sqrt(len(twists))

@@ -21,7 +21,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import get_args
 
-from run import conditions, run_timed, timed
+from run import conditions, run_program, run_timed
 
 from cuspid.pipeline.scan import Quality
 from cuspid.runtime.workers import core_numbers
@@ -48,7 +48,7 @@ def measured(scan: Path, quality: str, cores: list[int], log: Path, known: Known
     shutil.rmtree(out, ignore_errors=True)
     arguments = ["reconstruct", str(scan / "capture"), "--quality", quality, "--out", str(out)]
     with only(cores), log.open("ab") as stream:
-        status, took = timed(sys.executable, str(HERE / "staged.py"), str(stages), *arguments, log=stream)
+        status, took = run_program(sys.executable, str(HERE / "staged.py"), str(stages), *arguments, log=stream)
     if status:
         raise SystemExit(f"cuspid {' '.join(arguments)}: status {status}, see {log}")
     digest = sha256((out / "mesh.ply").read_bytes()).hexdigest()

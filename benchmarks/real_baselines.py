@@ -43,7 +43,7 @@ def sgbm(given: Path, out: Path) -> dict[str, Any]:
             maps.append(_pair_depth(capture, name, other))
     write_depth_maps(out / "depth" / f"{FRAME}.npz", maps)
     detail = detail_mm(capture.handpiece)
-    options = FusionOptions(min_maps=min(2, len(maps) - 1)).resolved(detail, capture.handpiece.footprint_mm)
+    options = FusionOptions(min_maps=min(2, len(maps) - 1)).resolve(detail, capture.handpiece.footprint_mm)
     fused = fuse(maps, {FRAME: Rigid3.identity()}, detail, options)
     if len(fused.mesh.faces):
         write_mesh(out / "mesh.ply", fused.mesh)

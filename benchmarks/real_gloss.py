@@ -22,8 +22,8 @@ from scipy.io import loadmat
 
 from cuspid.geometry import unit
 from cuspid.model.rig import Light
-from cuspid.mvs.glare import STRENGTH, mirrored
-from cuspid.mvs.shading import ShadingOptions, trusted
+from cuspid.mvs.glare import STRENGTH, mirror_reflections
+from cuspid.mvs.shading import ShadingOptions, trust_weights
 from cuspid.storage import write_json
 
 HERE = Path(__file__).parent
@@ -66,14 +66,14 @@ def spots(normals: Normals, directions: Float[np.ndarray, "lights 3"]) -> Pixels
     ahead = np.array([0.0, 0.0, 1.0])
     points = np.broadcast_to(ahead, normals.shape)
     lights = [Light(position_mm=ahead + FAR * each, direction=-each, glare=1.0) for each in directions]
-    return np.stack([mirrored(points, normals, [light])[:, 0] for light in lights], axis=1)
+    return np.stack([mirror_reflections(points, normals, [light])[:, 0] for light in lights], axis=1)
 
 
 def trust_in(brightness: Pixels, spot: Pixels) -> Float32[np.ndarray, "n lights"]:
     """Weights, as images of teeth have them."""
     level = 255 * np.clip(brightness / np.percentile(brightness, BRIGHT_PCT), 0, 1) ** (1 / GAMMA)
     uncertain = (STRENGTH * spot).astype(np.float32)
-    return trusted(level.astype(np.float32), uncertain, GAMMA, ShadingOptions().glare_dn)
+    return trust_weights(level.astype(np.float32), uncertain, GAMMA, ShadingOptions().glare_dn)
 
 
 def figures(brightness: Pixels, directions: Float[np.ndarray, "lights 3"], truth: Normals) -> dict[str, float]:

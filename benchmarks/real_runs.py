@@ -13,7 +13,7 @@ from typing import Any
 from real_sets import Set, offered
 
 from cuspid.storage import read_json, write_json
-from cuspid_thesis.scan_cases import commit, timed
+from cuspid_thesis.scan_cases import commit, run_program
 
 TIMED_OUT = 124
 _WARNING = re.compile(rb"^.*\.py:\d+: \w*Warning: .*$", re.MULTILINE)
@@ -26,7 +26,7 @@ def run(each: Set, data: Path, folder: Path, timeout_s: float) -> dict[str, Any]
     given, out, log = offered(each, data, folder / "given"), folder / "out", folder / "log.txt"
     command = [sys.executable, "-m", "cuspid", "reconstruct", str(given), "--out", str(out), *each.arguments]
     with log.open("wb") as stream:
-        status, took = timed("timeout", "-k", "20", str(timeout_s), *command, log=stream)
+        status, took = run_program("timeout", "-k", "20", str(timeout_s), *command, log=stream)
     said = log.read_bytes()
     for where in (given, out, data.resolve(), folder.resolve()):  # no result tells of the machine's folders
         said = said.replace(str(where).encode(), where.name.encode())

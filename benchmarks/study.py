@@ -5,7 +5,7 @@
 JAWS holds meshes of real jaws (half of those below were looked at only when all was done). Parts: ``errors`` (scale,
 bends, noise, a dent, holes, other triangles, cut borders; each moved at random), ``one_end`` (aligned at one end of a
 bent arch, read at the other), ``coverage`` (intervals of 200 simulated studies), ``bodies`` (scan bodies with noise and
-a third missing), ``cloudcompare`` (distances beside CloudCompare's), ``speed`` (a share of 120 scans of 300 000 faces).
+a third missing), ``cloudcompare`` (distances beside CloudCompare's), ``speed`` (120 scans of 300 000 faces).
 What each part found is kept in the work folder.
 """
 
@@ -45,7 +45,7 @@ from cuspid.studies.scanners.inference import compare_scanners, mean_estimate, p
 from cuspid.studies.scanners.scan import StudyOptions, measure_file
 from cuspid.studies.scanners.specimen import Specimen, load_specimen
 from cuspid.studies.scanners.study import Intake, prepare, specimen_of
-from cuspid.studies.scanners.summary import compared, find_common, scan_row
+from cuspid.studies.scanners.summary import compare_scan, find_common, scan_row
 
 JAWS = {
     "teeth3ds/0140W3ND_lower.ply": True,
@@ -58,7 +58,7 @@ JAWS = {
     "teeth3ds/Q5GSR6N2_lower.ply": False,
 }
 """Whether the jaw was looked at while the code was written."""
-STUDIES, LARGE_FACES, SPEED_SCANS = 200, 300_000, 12
+STUDIES, LARGE_FACES, SPEED_SCANS = 200, 300_000, 120
 LEAST_PIECE = 500
 """Places on a piece that is aligned or read."""
 
@@ -102,7 +102,7 @@ def known_errors(jaws: Path, work: Path, count: int) -> list[dict[str, Any]]:
         case, looked_at = truths[scan.specimen, scan.scan]
         specimen = specimen_of(out, scan.specimen)
         common = find_common(specimen, [scan], out / "scans", options)
-        found = compared(scan, out / "scans", specimen, common, options)
+        found = compare_scan(scan, out / "scans", specimen, common, options)
         row = scan_row(found, common)
         rows.append(
             {

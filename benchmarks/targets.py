@@ -28,7 +28,7 @@ from cuspid.model.board import Board
 from cuspid.model.rig import Handpiece, Rig
 from cuspid.runtime.image_files import read_image
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
-from cuspid.simulation.manufacturing import ManufacturingOptions, built
+from cuspid.simulation.manufacturing import ManufacturingOptions, sample_built
 from cuspid.storage import write_json
 from cuspid.studies.grid import Case, Value, run_grid
 
@@ -49,7 +49,7 @@ STEPS = {"known": (1.0, 1.0), "off": (1.01, 10.0), "trusted": (1.01, 1.0)}
 
 def judge(*, board: str, tilt_deg: float, seed: int, instants: int, pixels: int) -> dict[str, Value]:
     """The figures of one handpiece before one board."""
-    true = built(
+    true = sample_built(
         six_cameras(DesignOptions(width_px=pixels, height_px=pixels)), replace(TOLERANCES, manufacturing_seed=seed)
     )
     shown = PhotographOptions(instants=instants, max_tilt_deg=tilt_deg, supersampling=2, seed=seed)

@@ -36,11 +36,11 @@ def pages() -> dict[str, str]:
 
 def parser(command: Any) -> argparse.ArgumentParser:
     """The parser of one verb. tyro calls this way of getting it deprecated but offers no other that is public."""
-    from cuspid.cli.usage import described
+    from cuspid.cli.usage import describe_command
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        shown, registry = described(command)
+        shown, registry = describe_command(command)
         return tyro.extras.get_parser(shown, registry=registry)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from cuspid_thesis import runs
 from cuspid_thesis.catalogue import BY_ID
 from cuspid_thesis.runs import Run, gather, missing, run_missing
-from cuspid_thesis.scan_cases import timed
+from cuspid_thesis.scan_cases import run_program
 
 ITEMS = (BY_ID["fig-2.2"], BY_ID["fig-3.15"])
 POPULATIONS = {"groups": {"lower-14": {"max_abs_asked_minus_measured_mm": 0.001}}}
@@ -31,7 +31,7 @@ while not (folder / "go").exists():
 
 
 def waits(task):
-    timed(sys.executable, "-c", PROGRAM, str(task.folder))
+    run_program(sys.executable, "-c", PROGRAM, str(task.folder))
     yield "visibility", {"surfaces": {"twelve-cameras": SEEN}}
 
 

@@ -11,7 +11,7 @@ from cuspid.runtime.errors import InputError
 from cuspid_thesis.catalogue import BY_ID, ITEMS, TABLE_3_2, MadeRows, Row, read_items
 from cuspid_thesis.computed import FIGURES, ROWS, TABLES
 from cuspid_thesis.judging import judge
-from cuspid_thesis.results import at, in_words
+from cuspid_thesis.results import in_words, value_at
 from cuspid_thesis.rules import AtMost, Equals, Holds
 
 ITEM = """
@@ -117,10 +117,10 @@ def test_of_several_results_the_first_that_is_there_counts():
 
 def test_a_path_leads_through_names_and_places():
     result = {"groups": [{"a": 1.0}, {"a": 2.0}], "50": 3}
-    assert (at(result, "groups.1.a"), at(result, "50")) == (2.0, 3)
+    assert (value_at(result, "groups.1.a"), value_at(result, "50")) == (2.0, 3)
     assert in_words("{ours:.0f} of {groups.0.a:.1f}", result, {"ours": 7.0}) == "7 of 1.0"
     with pytest.raises(KeyError):
-        at(result, "group.1")
+        value_at(result, "group.1")
 
 
 def test_every_function_is_asked_for_by_the_catalogue():

@@ -35,7 +35,7 @@ from cuspid_thesis.rules import (
     LessIsBetter,
     least_favourable,
 )
-from cuspid_thesis.runs import ALL_RESULTS, RUNS, SUBJECT_NAMES, gather, missing, needed, read_results
+from cuspid_thesis.runs import ALL_RESULTS, RUNS, SUBJECT_NAMES, gather, missing, needed_results, read_results
 from cuspid_thesis.scan_cases import run_timed
 from verbs import refused
 
@@ -66,7 +66,7 @@ def test_each_item_is_judged_or_lost_and_says_so():
 
 def test_what_judges_an_item_is_made_by_a_run():
     for item in ITEMS:
-        assert bool(needed([item])) != bool(item.lost), item.id
+        assert bool(needed_results([item])) != bool(item.lost), item.id
     assert len(set(ALL_RESULTS)) == len(ALL_RESULTS)
     assert len(SUBJECT_NAMES) == len(set(SUBJECT_NAMES)) == 10
 

@@ -227,7 +227,7 @@ def test_centroids_of_segments_are_in_px() -> None:
 
 def test_px_of_a_canvas_lead_back_to_where_they_are() -> None:
     placed = halves(about_centre([[1, 0.1], [0, 1.05]], width=160), about_centre([[1, 0.12], [0, 1.05]], width=160))
-    canvas = Canvas.around([placed])
+    canvas = Canvas.from_frames([placed])
     rows, columns = canvas.window(placed)
     pixels = frame_pixels(canvas, placed, (rows, columns))
     seen = np.isfinite(pixels).all(axis=-1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from cuspid.anatomy.shape.boxed import BoxOptions, boxed, crown_boxes
+from cuspid.anatomy.shape.boxed import BoxOptions, box_crowns, crown_boxes
 from cuspid.model.jaw import GUM, Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
@@ -16,7 +16,7 @@ from cuspid.runtime.errors import InputError
 
 @pytest.fixture(scope="module")
 def result(coarse_phantom: Jaw) -> Jaw:
-    return boxed(coarse_phantom)
+    return box_crowns(coarse_phantom)
 
 
 def solid(mesh: Mesh) -> trimesh.Trimesh:
@@ -80,7 +80,7 @@ def test_sides_are_finely_divided(result: Jaw) -> None:
 
 
 def test_the_same_jaw_gives_the_same_boxes(coarse_phantom: Jaw, result: Jaw) -> None:
-    again = boxed(coarse_phantom)
+    again = box_crowns(coarse_phantom)
     assert np.array_equal(again.mesh.vertices, result.mesh.vertices)
     assert np.array_equal(again.mesh.faces, result.mesh.faces)
     assert np.array_equal(np.asarray(again.face_labels), np.asarray(result.face_labels))
@@ -108,7 +108,7 @@ def test_a_crown_that_is_a_box_stays_as_it_is() -> None:
     for fdi, size in zip((41, 42, 43), sizes, strict=True):
         # A tooth of the row and of the arch may be seen from either end; one millimetre of it is in the slab.
         assert crown_boxes(jaw)[fdi].size_mm == pytest.approx(np.subtract(size, [0, 0, 1]), abs=0.15)
-    made = boxed(jaw)
+    made = box_crowns(jaw)
     assert solid(made.mesh).is_watertight
     assert solid(made.mesh).volume == pytest.approx(solid(jaw.mesh).volume, rel=0.02)
 
@@ -116,35 +116,35 @@ def test_a_crown_that_is_a_box_stays_as_it_is() -> None:
 def test_a_gap_and_a_single_tooth_are_no_trouble(coarse_phantom: Jaw) -> None:
     labels = np.asarray(coarse_phantom.face_labels)
     for kept in (set(coarse_phantom.teeth) - {36}, {46}):
-        made = boxed(replace(coarse_phantom, face_labels=np.where(np.isin(labels, list(kept)), labels, GUM)))
+        made = box_crowns(replace(coarse_phantom, face_labels=np.where(np.isin(labels, list(kept)), labels, GUM)))
         assert set(made.teeth) == kept
         assert solid(made.mesh).is_watertight
 
 
 def test_a_box_can_go_on_into_the_gum(coarse_phantom: Jaw, result: Jaw) -> None:
-    deeper = boxed(coarse_phantom, BoxOptions(sink_mm=1.0, edge_mm=0.6))
+    deeper = box_crowns(coarse_phantom, BoxOptions(sink_mm=1.0, edge_mm=0.6))
     assert solid(deeper.mesh).volume > solid(result.mesh).volume
     assert len(deeper.mesh.faces) < len(result.mesh.faces)
 
 
 def test_an_open_scan_is_closed_below(coarse_phantom: Jaw) -> None:
     scanned = coarse_phantom.mesh.face_centres[:, 2] > coarse_phantom.mesh.bounds[0, 2] + 3
-    made = boxed(Jaw(mesh=coarse_phantom.mesh.submesh(scanned), face_labels=coarse_phantom.face_labels[scanned]))
+    made = box_crowns(Jaw(mesh=coarse_phantom.mesh.submesh(scanned), face_labels=coarse_phantom.face_labels[scanned]))
     assert made.teeth == coarse_phantom.teeth
     assert solid(made.mesh).is_watertight
 
 
 def test_what_cannot_be_boxed_is_refused(coarse_phantom: Jaw) -> None:
     with pytest.raises(InputError, match="no tooth labels"):
-        boxed(replace(coarse_phantom, face_labels=None))
+        box_crowns(replace(coarse_phantom, face_labels=None))
     with pytest.raises(InputError, match="no tooth labels"):
-        boxed(replace(coarse_phantom, face_labels=np.zeros(len(coarse_phantom.mesh.faces), dtype=np.int64)))
+        box_crowns(replace(coarse_phantom, face_labels=np.zeros(len(coarse_phantom.mesh.faces), dtype=np.int64)))
     doubled = np.concatenate([coarse_phantom.mesh.faces, coarse_phantom.mesh.faces[:1, ::-1]])
     labels = np.concatenate([coarse_phantom.face_labels, [GUM]])
     with pytest.raises(InputError, match=r"boxed jaw: not a solid .* shared by more than two faces"):
-        boxed(Jaw(mesh=Mesh(coarse_phantom.mesh.vertices, doubled), face_labels=labels))
+        box_crowns(Jaw(mesh=Mesh(coarse_phantom.mesh.vertices, doubled), face_labels=labels))
     flipped = Mesh(coarse_phantom.mesh.vertices, coarse_phantom.mesh.faces[:, ::-1])
     with pytest.raises(InputError, match="inside out"):
-        boxed(replace(coarse_phantom, mesh=flipped))
+        box_crowns(replace(coarse_phantom, mesh=flipped))
     with pytest.raises(InputError, match="edge-mm"):
         BoxOptions(edge_mm=0.0)

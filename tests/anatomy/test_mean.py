@@ -443,9 +443,9 @@ def test_smoothing_keeps_constants_and_spreads_as_far_as_it_says(base: Jaw) -> N
     template = Template.of(base.mesh, base.face_labels)
     everywhere = np.ones(len(base.mesh.vertices))
     constant = np.tile([1.0, -2.0, 3.0], (len(everywhere), 1))
-    assert np.allclose(template.smoothed(constant, everywhere, 1.0), constant)
+    assert np.allclose(template.smooth(constant, everywhere, 1.0), constant)
     assert np.allclose(
-        template.smoothed(constant, (np.arange(len(everywhere)) % 2).astype(float), 1.0), constant, atol=1e-3
+        template.smooth(constant, (np.arange(len(everywhere)) % 2).astype(float), 1.0), constant, atol=1e-3
     )
     # A step across a flat place: its slope is that of a Gaussian of the width that was asked for.
     x = base.mesh.vertices[:, 0]
@@ -453,5 +453,5 @@ def test_smoothing_keeps_constants_and_spreads_as_far_as_it_says(base: Jaw) -> N
         step = np.repeat((x > 0).astype(float)[:, None], 3, axis=1)
         flat = np.abs(base.mesh.vertex_normals[:, 0]) < 0.2
         near = flat & (np.abs(x) < 0.5 * sigma_mm)
-        slope = np.polyfit(x[near], template.smoothed(step, everywhere, sigma_mm)[near, 0], 1)[0]
+        slope = np.polyfit(x[near], template.smooth(step, everywhere, sigma_mm)[near, 0], 1)[0]
         assert 0.7 < slope * sigma_mm * np.sqrt(2 * np.pi) < 1.4

@@ -113,7 +113,7 @@ def test_condyles_that_slide_turn_the_jaw_less() -> None:
     mouths = [a_mouth(45.0, path=path) for path in (0.0, 6.0, 12.0)]
     assert np.all(np.diff([float(mouth.turn_rad) for mouth in mouths]) < 0)
     # The jaw swings back less under the skull: the molars stay more nearly above each other.
-    backwards = [-float(mouth.moved(45.0)[0]) for mouth in mouths]
+    backwards = [-float(mouth.displacement_mm(45.0)[0]) for mouth in mouths]
     assert np.all(np.diff(backwards) < -1)
     assert np.all(np.diff([float(mouth.vertical_gap_mm(45.0)) for mouth in mouths]) > 0.5)
     assert np.all(np.diff([float(mouth.gap_mm(45.0)) for mouth in mouths]) < -0.2)

@@ -6,21 +6,36 @@ import cv2
 import numpy as np
 import pytest
 
-from boards import BOARD, SIZE, moving, moving_pose, options, photographs, rolling_views, scene, undistorted, views_of
+from boards import (
+    BOARD,
+    SIZE,
+    moving,
+    moving_pose,
+    options,
+    photograph,
+    photographs,
+    pose_before,
+    rolling_views,
+    scene,
+    undistorted,
+    views_of,
+)
 from cuspid import storage
-from cuspid.calibration import bundle, calibrate
+from cuspid.calibration import bundle, calibrate, from_images
 from cuspid.calibration.board_shape import BoardShape
 from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
-from cuspid.calibration.start import board_pose, first_camera, renumbered
-from cuspid.calibration.timing import adjust_scene, rolling, untied
+from cuspid.calibration.start import board_pose, first_camera, renumber_instant
+from cuspid.calibration.timing import adjust_scene, allow_delays, rolling
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
 from cuspid.model.camera import Camera
+from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.rig import Rig
 from cuspid.model.shutter import PLAIN, frame_numbers
 from cuspid.runtime.errors import InputError, ReconstructionError
+from cuspid.runtime.progress import silent
 from verbs import refused, run
 
 CHESS = Board(kind="chessboard", columns=8, rows=8, square_mm=2.0)
@@ -123,12 +138,12 @@ def test_jacobian_agrees_with_finite_differences(exposure):
     views = views_of(truth, BOARD, 1.0, np.random.default_rng(0))
     if exposure != "together":
         frame, rng = frame_numbers(truth.rig_from_board), np.random.default_rng(1)
-        truth = untied(truth, frame, views)
+        truth = allow_delays(truth, frame, views)
         truth = rolling(truth, frame, views) if exposure == "rolling" else truth
         later = [rng.normal(0, 0.2, count) for count in (3, len(truth.timing.readout), len(views))]
         truth = replace(truth, timing=truth.timing.later(*later))
     even = BoardShape.even(BOARD)
-    truth = replace(truth, shape=even.moved(np.random.default_rng(2).normal(0, 0.05, even.offsets_mm.size)))
+    truth = replace(truth, shape=even.with_step(np.random.default_rng(2).normal(0, 0.05, even.offsets_mm.size)))
     seen = bundle._Observations.of(views, BOARD, truth)
     free = bundle._Free.of(truth, seen, BOARD, only_boards=False)
     values = bundle._derivatives(truth, seen, bundle._project(truth, seen).in_cam)
@@ -226,12 +241,12 @@ def test_an_instant_that_is_numbered_otherwise_is_found_before_an_uneven_board(f
     about = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.array([*CHESS.size_mm, 0.0]))
     poses = {**uneven.rig_from_board, "05": uneven.rig_from_board["05"] @ about}
     start = replace(uneven, rig_from_board=poses)
-    start = untied(start, frame_numbers(poses), turned) if filmed else start
-    found = renumbered(adjust_scene(start, turned, CHESS, only_boards=True), turned, CHESS)
+    start = allow_delays(start, frame_numbers(poses), turned) if filmed else start
+    found = renumber_instant(adjust_scene(start, turned, CHESS, only_boards=True), turned, CHESS)
     assert found is not None
     assert all(np.array_equal(view.corner, views[key].corner) for key, view in found[1].items())
     assert np.allclose(found[0].rig_from_board["05"].matrix, uneven.rig_from_board["05"].matrix, atol=0.01)
-    assert renumbered(adjust_scene(uneven, views, CHESS, only_boards=True), views, CHESS) is None
+    assert renumber_instant(adjust_scene(uneven, views, CHESS, only_boards=True), views, CHESS) is None
 
 
 @pytest.mark.long
@@ -581,6 +596,29 @@ def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
     assert {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()} == before
 
 
+def test_a_dark_board_of_16_bits_has_the_corners_of_a_bright_one(tmp_path):
+    """Of which 8 bits would leave 16 levels of grey."""
+    board = Board(columns=8, rows=8, square_mm=2.0)
+    truth = undistorted(scene(10, board, cameras=1, instants=1).cameras["cam0"])
+    seen = np.dstack([photograph(board, truth, pose_before(board, 24.0, 30.0)).astype(np.uint16)] * 3)
+    bright = 257 * seen + np.random.default_rng(0).integers(0, 257, seen.shape).astype(np.uint16)
+    storage.write_image(tmp_path / "cam/1.png", bright)
+    storage.write_image(tmp_path / "cam/2.png", bright // 16)
+    views = from_images._views({"cam": storage.read_sequence(tmp_path / "cam")}, board, silent)
+    one, other = views["cam", "1"], views["cam", "2"]
+    assert np.array_equal(one.corner, other.corner)
+    assert len(one.corner) == 49
+    assert 0 < np.abs(one.pixels - other.pixels).max() < 0.02
+
+
+def test_films_tell_their_rate_where_they_have_one(tmp_path):
+    def sequence(rate):
+        return ImageSequence(source=tmp_path, paths=(), size=SIZE, frames_per_s=rate)
+
+    for rates, common in (((25.0, 25.1), 25.0), ((25.0, 30.0), None), ((25.0, None), None), ((None,), None)):
+        assert from_images._common_rate({str(k): sequence(rate) for k, rate in enumerate(rates)}) == common
+
+
 def test_photographs_that_are_there_are_not_taken_again(tmp_path):
     run("rig", "build", "--design", "four", "--width-px", 60, "--height-px", 60, "--out", tmp_path / "drawn")
     take = ("rig", "photograph", tmp_path / "drawn" / "handpiece.json", "--out", tmp_path / "out", "--instants", 3)
@@ -638,14 +676,16 @@ def test_a_readout_is_found_along_the_path_of_the_board_and_turns_with_the_camer
     whole = moving(3, instants=20)
     truth = replace(whole, cameras={"cam1": whole.cameras["cam1"]})
     views = rolling_views(truth, {"cam1": 0.6}, {}, 0.1, np.random.default_rng(3))
-    found = calibrate_rig(views, {"cam1": SIZE}, BOARD, CalibrationOptions(lens="OPENCV"))
+    how = CalibrationOptions(lens="OPENCV", frames_per_s=20.0)
+    found = calibrate_rig(views, {"cam1": SIZE}, BOARD, how)
     check, shutter = found.cameras["cam1"], found.rig["cam1"].shutter
     assert (shutter.readout, shutter.readout_sigma) == (check.readout, check.readout_sigma)
     assert check.delay_frames is None
     assert 0 < check.readout_sigma < 0.02
     assert abs(check.readout - 0.6) < 3 * check.readout_sigma
     assert lens_error(found, truth, "cam1") < 2
-    assert any(f"cam1 {check.readout:+.3f} ± {check.readout_sigma:.3f}" in note for note in found.notes)
+    told = f"cam1 {check.readout:+.3f} ± {check.readout_sigma:.3f} ({50 * check.readout:+.1f} ms)"
+    assert any(told in note for note in found.notes)
     ignored = calibrate_rig(views, {"cam1": SIZE}, BOARD, CalibrationOptions(lens="OPENCV", shutter="global"))
     assert ignored.cameras["cam1"].readout is None
     assert ignored.rig["cam1"].shutter == PLAIN

@@ -17,14 +17,14 @@ from cuspid.calibration import corners
 from cuspid.calibration.calibrate import size_notes
 from cuspid.calibration.causes import cause_of_absence, is_part_of_a_larger_one
 from cuspid.calibration.corners import find_corners
-from cuspid.calibration.from_images import _matched
+from cuspid.calibration.from_images import _match_frames
 from cuspid.calibration.instants import common_instants
 from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.camera import Camera
 from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.rig import Rig
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.image_files import exif_orientation, read_image, recorded
+from cuspid.runtime.image_files import exif_orientation, read_image, undo_exif_orientation
 from verbs import refused, run
 
 BOARD = Board(columns=7, rows=6, square_mm=2.5)
@@ -136,7 +136,7 @@ def test_prefixed_images_are_matched_and_it_is_told() -> None:
         )
         for camera in ("left", "right")
     }
-    matched, (note,) = _matched(sequences)
+    matched, (note,) = _match_frames(sequences)
     assert [each.names for each in matched.values()] == [("1", "2"), ("1", "2")]
     assert "left: left_0001 is 1, right: right_0001 is 1" in note
 
@@ -172,7 +172,7 @@ def test_a_turned_image_is_turned_back_to_the_sensor(tmp_path: Path, orientation
     exif[0x0112] = orientation
     Image.fromarray(sensor).save(tmp_path / "x.png", exif=exif)
     assert exif_orientation(tmp_path / "x.png") == orientation
-    np.testing.assert_array_equal(recorded(read_image(tmp_path / "x.png"), orientation), sensor)
+    np.testing.assert_array_equal(undo_exif_orientation(read_image(tmp_path / "x.png"), orientation), sensor)
 
 
 @pytest.mark.parametrize("ways", [(1, 6), (3, 1), (8, 6), (6, 6)])

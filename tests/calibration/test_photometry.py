@@ -30,7 +30,7 @@ from cuspid.model.board import Board
 from cuspid.model.rig import Handpiece, Light, Sensor
 from cuspid.runtime.errors import InputError
 from cuspid.simulation.board_images import PhotographOptions, board_light, board_poses, take_photographs
-from cuspid.simulation.manufacturing import ManufacturingOptions, built
+from cuspid.simulation.manufacturing import ManufacturingOptions, sample_built
 from cuspid.simulation.raycast import pixel_rays
 from cuspid.simulation.sensor import expose, record
 from verbs import refused, run
@@ -122,7 +122,7 @@ def located(true: Handpiece, poses: Mapping[str, Rigid3]) -> RigCalibration:
 
 @cache
 def rehearsal(lit: str, seed: int) -> Rehearsal:
-    return Rehearsal(built(DRAWN, replace(BUILT, manufacturing_seed=seed)), lit, seed)
+    return Rehearsal(sample_built(DRAWN, replace(BUILT, manufacturing_seed=seed)), lit, seed)
 
 
 def camera_errors(found: Photometry, true: Handpiece) -> np.ndarray:
@@ -347,7 +347,7 @@ def test_without_gain_and_falloff_images_are_the_same_bits():
     dimmed = record(light, 1.0, dim, "o1", np.random.default_rng(1)).astype(float)
     assert dimmed[100, 100].mean() == pytest.approx(plain[100, 100].mean(), abs=2)
     assert dimmed[:9, :9].mean() < 0.85 * plain[:9, :9].mean()
-    assert built(DRAWN, ManufacturingOptions()).sensors == {}
+    assert sample_built(DRAWN, ManufacturingOptions()).sensors == {}
 
 
 def test_sensors_and_covariances_are_written_only_where_they_are(tmp_path):
@@ -380,7 +380,7 @@ def test_a_calibration_with_lights_is_rehearsed(tmp_path, capsys):
     drawn = tmp_path / "drawn.json"
     storage.write_handpiece(drawn, DRAWN)
     how = PhotographOptions(instants=12, supersampling=1, lit="one-by-one")
-    take_photographs(built(DRAWN, replace(BUILT, manufacturing_um=10.0)), BOARD, tmp_path / "photos", how)
+    take_photographs(sample_built(DRAWN, replace(BUILT, manufacturing_um=10.0)), BOARD, tmp_path / "photos", how)
     images = tmp_path / "photos" / "images"
     run("calibrate", images, "--drawn", drawn, "--out", tmp_path / "rig", *board_options(BOARD))
     true = storage.read_handpiece(tmp_path / "photos" / "truth" / "handpiece.json")

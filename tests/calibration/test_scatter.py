@@ -105,8 +105,8 @@ def test_nodes_carry_their_corners() -> None:
     across = np.linspace(2, 60, 14)
     down = np.linspace(2, 40, 14)
     plane = np.stack([*np.meshgrid(across, down), np.zeros((14, 14))], axis=-1).reshape(-1, 3)
-    shape = shape.moved(plane.ravel())
-    assert np.allclose(shape.at(nodes, shares), board.corners * [1, 1, 0])
+    shape = shape.with_step(plane.ravel())
+    assert np.allclose(shape.interpolate(nodes, shares), board.corners * [1, 1, 0])
 
 
 def test_the_difference_of_lenses_leaves_out_a_turn() -> None:

@@ -70,6 +70,7 @@ def test_a_video_is_decoded_frame_by_frame(tmp_path: Path) -> None:
     sequence = storage.read_sequence(write_video(tmp_path / "film.avi", 6), tmp_path / "decoded")
     assert sequence.names == tuple(f"{index:05d}" for index in range(6))
     assert sequence.size == (160, 120)
+    assert sequence.frames_per_s == pytest.approx(25.0)
     shown = sequence.image(3).astype(float)
     assert np.abs(shown - picture(3)).mean() < 12 < np.abs(shown - picture(2)).mean()
 

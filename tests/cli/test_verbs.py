@@ -12,7 +12,7 @@ import pytest
 from builders import box_mesh, handpiece, image_path, make_capture, shifted, sphere
 from cuspid import __version__, cli, storage
 from cuspid.cli.scan import _evaluate_trajectory
-from cuspid.cli.shared import Probe, load_probe, suited
+from cuspid.cli.shared import Probe, load_probe, suit_lights
 from cuspid.geometry import Rigid3
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
@@ -63,13 +63,13 @@ def test_without_blender_nothing_is_written(tmp_path, capsys, monkeypatch, coars
 
 def test_plain_enamel_has_crossed_polarisers_unless_others_are_asked_for(capsys):
     def glare(probe, texture):
-        return {light.glare for light in load_probe(suited(probe, texture)).lights.values()}
+        return {light.glare for light in load_probe(suit_lights(probe, texture)).lights.values()}
 
     assert max(glare(Probe(), "enamel")) < 0.1
     assert "--lights white" in " ".join(capsys.readouterr().err.split())
     assert glare(Probe(), "artificial") == glare(Probe(lights="white"), "enamel") == {1.0}
     assert max(glare(Probe(lights="colour-coded"), "artificial")) < 0.1
-    assert suited(Probe(handpiece=Path("mine.json")), "enamel") == Probe(handpiece=Path("mine.json"))
+    assert suit_lights(Probe(handpiece=Path("mine.json")), "enamel") == Probe(handpiece=Path("mine.json"))
     assert not capsys.readouterr().err
 
 

@@ -9,7 +9,7 @@ import pytest
 from cuspid.evaluation.deformation import MODES, fit_deformation, mode_fields
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import scatter
-from cuspid.evaluation.registration import RegistrationOptions, located, refine
+from cuspid.evaluation.registration import RegistrationOptions, locate_place, refine
 from cuspid.evaluation.scan_bodies import fit_body
 from cuspid.evaluation.spans import Station, slope_ppm, spans
 from cuspid.geometry import Rigid3
@@ -129,7 +129,7 @@ def test_growth_does_not_shift_where_a_tooth_is_found(jaw):
     points, _ = tooth.sample(3000, np.random.default_rng(0))
     surface, middle = SignedDistance(jaw.mesh), points.mean(axis=0)
     pose = refine(1.001 * points, surface, Rigid3.identity(), RegistrationOptions())
-    assert 1000 * np.linalg.norm(located(1.001 * points, surface, pose, middle) - 1.001 * middle) < 0.5
+    assert 1000 * np.linalg.norm(locate_place(1.001 * points, surface, pose, middle) - 1.001 * middle) < 0.5
     assert 1000 * np.linalg.norm(pose.inverse().apply(middle) - 1.001 * middle) > 0.5
 
 

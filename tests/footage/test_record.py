@@ -38,7 +38,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.board import Board, BoardSet
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Handpiece, MountedCamera, Rig
-from cuspid.report.preview import Preview, marked
+from cuspid.report.preview import Preview, mark_focus
 from cuspid.runtime.errors import InputError, OutputError
 from cuspid.runtime.image_files import read_image
 from cuspid.storage.files import AppendedTable
@@ -675,14 +675,14 @@ def test_the_preview_marks_what_is_sharp_and_what_is_not_covered():
     squares = np.kron(np.indices((30, 30)).sum(axis=0) % 2, np.ones((8, 8)))
     sharp = np.repeat(np.rint(60 + 120 * squares).astype(np.uint8)[..., None], 3, axis=2)
     sharp[:, 120:] = cv2.GaussianBlur(sharp[:, 120:], (0, 0), 3)
-    green = (marked(sharp) == (40, 255, 90)).all(axis=2)
+    green = (mark_focus(sharp) == (40, 255, 90)).all(axis=2)
     half = green.shape[1] // 2
     assert green[:, :half].mean() > 0.02
     assert green[:, half + 20 :].mean() < 0.001
     covered = np.ones((6, 6))
     covered[0, 0] = 0
     plain = np.full((240, 240, 3), 100, np.uint8)
-    shown = marked(plain, covered)
+    shown = mark_focus(plain, covered)
     assert (shown[100:, 100:] == 100).all()
     assert shown[20, 20, 0] > 130 > 100 > shown[20, 20, 2]
 

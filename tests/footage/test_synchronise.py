@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from builders import mottled
 from cuspid import storage
-from cuspid.footage.quality import Looks, QualityOptions, faults, look, seen
+from cuspid.footage.quality import Looks, QualityOptions, faults, measure_quality, shrink_to_grey
 from cuspid.footage.synchronise import (
     SyncOptions,
     by_names,
@@ -391,8 +391,8 @@ def test_bad_images_are_named_with_their_reason_and_only_they_are_left_out(tmp_p
 
 
 def looks_of(images: Sequence[np.ndarray]) -> Looks:
-    shown = [seen(image) for image in images]
-    rows = [look(each, shown[k - 1] if k else None) for k, each in enumerate(shown)]
+    shown = [shrink_to_grey(image) for image in images]
+    rows = [measure_quality(each, shown[k - 1] if k else None) for k, each in enumerate(shown)]
     level, bright, burnt, sharpness, change = np.array(rows).T
     nothing = np.full(len(images), np.nan)
     return Looks(

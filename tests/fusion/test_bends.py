@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from builders import box_mesh, plate, sphere
-from cuspid.fusion.bends import bent, halved
+from cuspid.fusion.bends import find_bends, subdivide_edges
 from cuspid.model.mesh import Mesh, edges_of
 
 
@@ -16,7 +16,7 @@ from cuspid.model.mesh import Mesh, edges_of
 def test_halved_faces_cover_the_same_surface(seed: int, share: float) -> None:
     mesh = sphere(1.0, 2)
     marked = np.random.default_rng(seed).random(len(mesh.vertices)) < share
-    finer = halved(mesh, marked)
+    finer = subdivide_edges(mesh, marked)
     ends = edges_of(mesh.faces)
     sides = np.unique(np.sort(ends[marked[ends].all(axis=1)], axis=1), axis=0)
     assert (finer.vertices[: len(mesh.vertices)] == mesh.vertices).all()
@@ -33,22 +33,22 @@ def test_halved_faces_cover_the_same_surface(seed: int, share: float) -> None:
 
 def test_all_marked_gives_four_faces_for_one_and_none_the_mesh_itself() -> None:
     mesh = sphere(1.0, 2)
-    assert len(halved(mesh, np.ones(len(mesh.vertices), dtype=bool)).faces) == 4 * len(mesh.faces)
-    same = halved(mesh, np.zeros(len(mesh.vertices), dtype=bool))
+    assert len(subdivide_edges(mesh, np.ones(len(mesh.vertices), dtype=bool)).faces) == 4 * len(mesh.faces)
+    same = subdivide_edges(mesh, np.zeros(len(mesh.vertices), dtype=bool))
     assert (same.faces == mesh.faces).all()
     assert (same.vertices == mesh.vertices).all()
 
 
 def test_only_edges_bend() -> None:
-    assert bent(box_mesh(), 0).all()
+    assert find_bends(box_mesh(), 0).all()
     flat = plate(0.0, 1.0)
-    assert not bent(flat, 2).any()
+    assert not find_bends(flat, 2).any()
     fold = Mesh(flat.vertices + np.abs(flat.vertices[:, :1]) * [0, 0, 1], flat.faces)
     spacing = 2.0 / 20
     for rings in (0, 1, 2):
-        across = np.abs(fold.vertices[bent(fold, rings), 0])
+        across = np.abs(fold.vertices[find_bends(fold, rings), 0])
         assert abs(across.max() - (1 + rings) * spacing) < 1e-9
-        assert bent(fold, rings).sum() == (np.abs(fold.vertices[:, 0]) < (1.5 + rings) * spacing).sum()
+        assert find_bends(fold, rings).sum() == (np.abs(fold.vertices[:, 0]) < (1.5 + rings) * spacing).sum()
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    assert bent(nothing, 1).shape == (0,)
-    assert len(halved(nothing, bent(nothing, 1)).faces) == 0
+    assert find_bends(nothing, 1).shape == (0,)
+    assert len(subdivide_edges(nothing, find_bends(nothing, 1)).faces) == 0

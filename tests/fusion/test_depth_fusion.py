@@ -21,7 +21,7 @@ from cuspid.fusion.evidence import Evidence, observe, observe_foot
 from cuspid.fusion.sharp_edges import SharpEdgeOptions
 from cuspid.fusion.stage import find_holes as find_holes_once
 from cuspid.fusion.stage import fuse as fuse_once
-from cuspid.fusion.volume import around, find, pack, unpack
+from cuspid.fusion.volume import find, neighbour_keys, pack, unpack
 from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.mesh import Mesh
@@ -167,11 +167,11 @@ def test_depths_that_scatter_as_they_state_still_make_a_surface() -> None:
 
 @pytest.mark.parametrize("ratio", [1.0, 4.0])
 def test_the_grid_follows_the_footprint_half_way(ratio: float) -> None:
-    resolved = FusionOptions().resolved(ratio * 0.1, 0.1)
+    resolved = FusionOptions().resolve(ratio * 0.1, 0.1)
     assert resolved.voxel_for(ratio * 0.1) == pytest.approx(np.sqrt(ratio) * FusionOptions().voxel_for(0.1))
     blended = resolved.truncation_voxels * resolved.voxel_for(ratio * 0.1)
     assert blended == pytest.approx(ratio * FusionOptions().truncation_voxels * FusionOptions().voxel_for(0.1))
-    assert FusionOptions(voxel_mm=0.3).resolved(ratio * 0.1, 0.1) == FusionOptions(voxel_mm=0.3)
+    assert FusionOptions(voxel_mm=0.3).resolve(ratio * 0.1, 0.1) == FusionOptions(voxel_mm=0.3)
 
 
 def test_stored_maps_follow_each_other_frame_by_frame() -> None:
@@ -476,7 +476,7 @@ def test_block_keys_are_unique_and_invert(blocks: list[tuple[int, int, int]]) ->
 
 def test_neighbours_of_blocks() -> None:
     keys = pack(np.array([[0, 0, 0], [1, 0, 0], [0, -1, 0], [5, 5, 5]]))
-    near = find(keys, around(keys))
+    near = find(keys, neighbour_keys(keys))
     assert near[0, 13] == 0
     assert near[0, 22] == 1
     assert near[0, 10] == 2
@@ -487,7 +487,7 @@ def test_neighbours_of_blocks() -> None:
 
 def test_no_vertex_in_view_is_culled() -> None:
     mesh = fused_hills()
-    votes = Votes.on(mesh)
+    votes = Votes.empty(mesh)
     depth_map = depth_maps(HILLS)[0]
     cam_from_world = depth_map.cam_from_rig @ POSES[depth_map.frame]
     in_view = depth_map.camera.contains(depth_map.camera.project(cam_from_world.apply(mesh.vertices)))

@@ -44,21 +44,21 @@ def test_parts_are_together_the_whole_whenever_they_are_asked_for() -> None:
     surface, parts = GrowingSurface(DETAIL_MM), dict[int, Mesh]()
     for k, z_mm in ((0, 0.0), (1, 0.0), (2, 0.3), (0, -0.5), (1, 0.4)):
         surface.add(maps_of(k), POSES[k] @ Rigid3(np.eye(3), np.array([0.0, 0.0, z_mm])))
-        news = surface.changed()
+        news = surface.pop_changes()
         parts |= news
         assert news
         assert np.array_equal(corners([*parts.values()]), corners([whole(surface)]))
     assert len(parts) > 3
-    assert surface.changed() == {}
+    assert surface.pop_changes() == {}
 
 
 def test_only_what_changed_is_told() -> None:
     """Of a frame elsewhere."""
     surface, away = GrowingSurface(DETAIL_MM), Rigid3(np.eye(3), np.array([40.0, 0.0, 0.0]))
     surface.add(maps_of(0), POSES[0])
-    before = surface.changed()
+    before = surface.pop_changes()
     surface.add(maps_of(0), POSES[0] @ away)
-    after = surface.changed()
+    after = surface.pop_changes()
     assert len(after) > 3
     assert not before.keys() & after.keys()
 
@@ -75,15 +75,15 @@ def test_what_is_taken_out_leaves_what_it_would_have_been_without(out: int) -> N
     mesh, expected = whole(surface), whole(never)
     assert len(mesh.faces) == len(expected.faces)
     assert expected.closest(mesh.vertices[np.unique(mesh.faces)])[0].max() < 1e-5
-    assert all(part.colors is not None and (part.colors == RED).all() for part in surface.changed().values())
+    assert all(part.colors is not None and (part.colors == RED).all() for part in surface.pop_changes().values())
 
 
 def test_nothing_is_left_of_what_was_alone() -> None:
     surface = GrowingSurface(DETAIL_MM)
     surface.add(maps_of(0), POSES[0])
-    there = surface.changed()
+    there = surface.pop_changes()
     surface.take_out(maps_of(0), POSES[0])
-    assert surface.changed().keys() == there.keys()
+    assert surface.pop_changes().keys() == there.keys()
     assert not len(whole(surface).faces)
     assert len(surface.hole_rims()) == 0
 
@@ -103,7 +103,7 @@ def test_colours_are_those_of_the_maps() -> None:
     surface = GrowingSurface(DETAIL_MM)
     surface.add(maps_of(0, RED), POSES[0])
     surface.add(maps_of(0, BLUE), POSES[0])
-    colors = np.concatenate([part.colors for part in surface.changed().values() if part.colors is not None])
+    colors = np.concatenate([part.colors for part in surface.pop_changes().values() if part.colors is not None])
     mixed = np.mean([RED, BLUE], axis=0)
     assert (np.abs(colors - mixed) <= 1).all(axis=1).mean() > 0.99
 

@@ -198,11 +198,11 @@ def test_a_lens_that_folds_within_its_image_is_used_where_it_shows_something() -
     """As that of a laparoscope whose calibration has a third radial term of -4 (real ones have -15)."""
     lens = np.array([-0.7, 2.9, 0, 0, -4.0, 0, 0, 0])
     camera = replace(Camera.from_field_of_view(360, 288, 80.0), model="FULL_OPENCV", distortion=lens)
-    assert camera.shown is not None
-    assert 0.3 < camera.shown.mean() < 0.95
-    assert camera.shown[144, 180]
-    assert not camera.shown[0, 0]
-    assert Camera.from_field_of_view(360, 288, 80.0).shown is None
+    assert camera.valid_mask is not None
+    assert 0.3 < camera.valid_mask.mean() < 0.95
+    assert camera.valid_mask[144, 180]
+    assert not camera.valid_mask[0, 0]
+    assert Camera.from_field_of_view(360, 288, 80.0).valid_mask is None
     border = np.array([[0.0, 0.0], [360.0, 0.0], [360.0, 288.0]])
     rays = camera.rim_rays(border)
     assert np.isfinite(rays).all()

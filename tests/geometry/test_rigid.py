@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cuspid.geometry import Rigid3, axes_about, best_similarity, distinct_rows, lengths_along, owned, unit
+from cuspid.geometry import Rigid3, axes_about, best_similarity, distinct_rows, freeze, lengths_along, unit
 from cuspid.runtime.errors import InputError
 from strategies import points, rigid3s, vectors
 
@@ -157,6 +157,6 @@ def test_distinct_rows_are_those_that_numpy_finds(rows):
 
 def test_what_is_owned_is_not_copied_and_cannot_be_changed():
     array = np.zeros(3)
-    assert owned(array) is array
+    assert freeze(array) is array
     with pytest.raises(ValueError, match="read-only"):
         array[0] = 1

@@ -298,7 +298,7 @@ def test_a_section_is_cut_from_a_jaw_with_the_surfaces_of_the_tooth(section: Sec
     )
     count = len(far.faces)
     tooth = np.arange(2 * count) < count
-    cut = Section.near(both, tooth, {"occlusal": np.tile(section.surfaces["occlusal"], 2)}, section.rig_from_world)
+    cut = Section.cut(both, tooth, {"occlusal": np.tile(section.surfaces["occlusal"], 2)}, section.rig_from_world)
     assert len(cut.mesh.faces) == count
     np.testing.assert_array_equal(cut.surfaces["occlusal"], section.surfaces["occlusal"])
 

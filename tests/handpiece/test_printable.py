@@ -11,7 +11,7 @@ from cuspid import storage
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.cad.holder import HolderOptions
 from cuspid.handpiece.cad.printability import check_printable, check_seats, check_sight, check_solid, thinnest
-from cuspid.handpiece.cad.printable import Printable, block, printable, rounded
+from cuspid.handpiece.cad.printable import Printable, block, make_rounded_box, printable
 from cuspid.handpiece.cad.shell import PrintOptions, module_boxes
 from cuspid.handpiece.designs import DESIGNS, DesignOptions, six_cameras
 from cuspid.handpiece.intra_oral import intra_oral_camera
@@ -196,7 +196,7 @@ def test_a_duct_through_a_seat_is_told(four):
 
 
 def test_a_seat_without_a_way_out_is_told(four):
-    alone = rounded(four.handpiece.solid.parts["camera o1"], 0.1).translate([0.0, 0.0, 30.0])
+    alone = make_rounded_box(four.handpiece.solid.parts["camera o1"], 0.1).translate([0.0, 0.0, 30.0])
     with pytest.raises(InputError, match="a cable cannot pass"):
         check_solid(replace(four, channels={**four.channels, "lost": alone}))
 

@@ -22,7 +22,7 @@ from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.model.room import Room, check_clearance, room_about, surface_points
 from cuspid.runtime.errors import InputError
-from cuspid.simulation.path.detour import up
+from cuspid.simulation.path.detour import lifted_from_rig
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 
 CUBE = Body({"cube": Box(Rigid3.identity(), np.array([1.0, 1.0, 1.0]))})
@@ -114,7 +114,7 @@ def test_behind_an_open_sheet_is_not_inside() -> None:
 def test_opening_the_jaw_far_away_changes_no_verdict(coarse_phantom: Jaw, length_mm: float, height_mm: float) -> None:
     """The phantom is closed; cut off 25 mm from the handpiece, it is an open sheet with the same room."""
     mesh, body = coarse_phantom.mesh, twelve_cameras().solid
-    pose = up(height_mm) @ arch_curve(coarse_phantom).rig_from_world(length_mm)
+    pose = lifted_from_rig(height_mm) @ arch_curve(coarse_phantom).rig_from_world(length_mm)
     near = np.linalg.norm(mesh.face_centres - pose.inverse().translation, axis=1) < 25.0
     assert near.mean() < 0.7
     closed, opened = (Room(each, body, 0.5).clearance(pose) for each in (mesh, mesh.submesh(near)))
@@ -125,7 +125,7 @@ def test_opening_the_jaw_far_away_changes_no_verdict(coarse_phantom: Jaw, length
 
 def test_the_verdicts_of_that_law_differ(coarse_phantom: Jaw) -> None:
     curve, room = arch_curve(coarse_phantom), Room(coarse_phantom.mesh, twelve_cameras().solid, 0.5)
-    found = [room.clearance(up(lift) @ curve.rig_from_world(45.0))[0] for lift in (-8.0, 0.0, 3.0)]
+    found = [room.clearance(lifted_from_rig(lift) @ curve.rig_from_world(45.0))[0] for lift in (-8.0, 0.0, 3.0)]
     assert found[0] < 0
     assert 0.5 < found[1] < found[2]
 

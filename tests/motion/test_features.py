@@ -16,7 +16,14 @@ from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.capture import Capture
 from cuspid.model.rig import Handpiece, MountedCamera, Rig
-from cuspid.motion.frontend.features import DESCRIPTOR_NORM, FeatureOptions, detect, detect_all, spread, without_doubles
+from cuspid.motion.frontend.features import (
+    DESCRIPTOR_NORM,
+    FeatureOptions,
+    detect,
+    detect_all,
+    select_evenly,
+    without_doubles,
+)
 from cuspid.motion.frontend.pairs import match_unguided
 from cuspid.motion.frontend.pictures import Pictures
 from cuspid.runtime.errors import InputError, OutputError
@@ -134,7 +141,7 @@ def test_spread_takes_the_strongest_of_each_cell_first(count: int, seed: int) ->
     """A keypoint that is left out has no stronger rank in its cell than any taken; some lie off the image by a hair."""
     rng = np.random.default_rng(seed)
     pixels, strengths = rng.uniform([-0.4, 0], 100, (80, 2)), rng.random(80)
-    chosen = spread(pixels, strengths, count, 25)
+    chosen = select_evenly(pixels, strengths, count, 25)
     assert len(chosen) == len(np.unique(chosen)) == min(count, 80)
     cells = (pixels // 25).astype(int) @ [1, 10]
     rank = np.array([np.sum((cells == cells[k]) & (strengths > strengths[k])) for k in range(80)])

@@ -14,7 +14,7 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Handpiece, MountedCamera, Rig
-from cuspid.model.tolerances import NominalOptions, Tolerances, held
+from cuspid.model.tolerances import NominalOptions, Tolerances, without_covariances
 from cuspid.motion.bundle.held_calibration import depth_sigma_mm
 
 
@@ -47,13 +47,13 @@ def test_turns_of_cameras_move_depth_with_the_square_of_the_distance(turn_deg: f
 
 @pytest.mark.long
 def test_an_exact_handpiece_measures_exactly_and_a_larger_one_errs_in_proportion() -> None:
-    drawn = held(twelve_cameras())
+    drawn = without_covariances(twelve_cameras())
     assert depth_sigma_mm(drawn) == 0
-    nominal = NominalOptions().of(drawn).fill(drawn)
+    nominal = NominalOptions().for_handpiece(drawn).fill(drawn)
     sigma = depth_sigma_mm(nominal)
     assert 0.03 < sigma < 0.12
     larger = times(drawn, 3.0)
-    assert depth_sigma_mm(NominalOptions().of(larger).fill(larger)) == pytest.approx(3 * sigma, rel=1e-3)
+    assert depth_sigma_mm(NominalOptions().for_handpiece(larger).fill(larger)) == pytest.approx(3 * sigma, rel=1e-3)
     lone = replace(nominal, rig=Rig(dict(list(nominal.rig.cameras.items())[:1])))
     assert depth_sigma_mm(lone) == 0
 

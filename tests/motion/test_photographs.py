@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cuspid import cli
@@ -290,6 +291,26 @@ def test_keypoints_outside_of_masks_are_not_used(folder, tmp_path):
         progress=lambda *_: None,
     )
     assert all(len(each) > 100 and each.pixels[:, 0].max() <= WIDE.width / 2 + 1 for each in features.values())
+
+
+@pytest.mark.parametrize("even", [False, True])
+def test_dark_photographs_of_16_bits_have_the_keypoints_of_bright_ones(tmp_path, even):
+    """Of which 8 bits would leave 16 levels of grey."""
+    seen = scene().images["IMG_00"].astype(np.uint16)
+    bright = 257 * seen + np.random.default_rng(0).integers(0, 257, seen.shape).astype(np.uint16)
+    for name, image in (("a", bright), ("b", bright // 16)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
+    found, _ = detect_in_all(
+        read_photographs(tmp_path, tmp_path).photographs,
+        PhotographOptions().features,
+        largest_px=2400,
+        even=even,
+        progress=lambda *_: None,
+    )
+    away, _ = cKDTree(found[1].pixels).query(found[0].pixels)
+    assert len(found[0]) > 500
+    assert 0 < np.median(away) < 0.02
+    assert np.mean(away < 0.5) > 0.95
 
 
 def test_photographs_are_told_from_captures(tmp_path, folder):

@@ -13,10 +13,16 @@ from cuspid.geometry import Rigid3, unit
 from cuspid.model.capture import Capture, Frame
 from cuspid.model.reconstruction import DepthMap, Reconstruction
 from cuspid.model.rig import Handpiece, Light
-from cuspid.model.tolerances import NominalOptions, held
+from cuspid.model.tolerances import NominalOptions, without_covariances
 from cuspid.motion.bundle.expectation import expectation_of
 from cuspid.motion.bundle.held_calibration import depth_sigma_mm
-from cuspid.motion.icp.surface_tracking import SurfaceTrackingOptions, _drift, _register_icp, adjusted, track_surfaces
+from cuspid.motion.icp.surface_tracking import (
+    SurfaceTrackingOptions,
+    _drift,
+    _register_icp,
+    adjust_poses,
+    track_surfaces,
+)
 from cuspid.motion.icp.surfaces import OrientedPoints, Surface
 from cuspid.runtime.errors import ReconstructionError
 from cuspid.runtime.progress import silent
@@ -86,7 +92,7 @@ def test_a_long_path_that_was_found_bent_is_straightened() -> None:
         pairs = zip(poses, way, strict=True)
         return max(1000 * float(np.linalg.norm((one @ other.inverse()).inverse().translation)) for one, other in pairs)
 
-    straight, _, expected = adjusted(surfaces, bent, SurfaceTrackingOptions(samples=500), 5.0, silent)
+    straight, _, expected = adjust_poses(surfaces, bent, SurfaceTrackingOptions(samples=500), 5.0, silent)
     assert off_um(bent) > 200
     assert 1 < off_um(straight) < 50
     assert expected is not None
@@ -112,7 +118,7 @@ def test_what_a_path_is_off_by_is_expected(errors: Callable[[np.random.Generator
     for seed in range(6):
         rng = np.random.default_rng(seed)
         surfaces, way = strip(20, rng, errors(rng))
-        found, _, expected = adjusted(surfaces, way, SurfaceTrackingOptions(samples=500), 5.0, silent)
+        found, _, expected = adjust_poses(surfaces, way, SurfaceTrackingOptions(samples=500), 5.0, silent)
         assert expected is not None
         frames = np.array_split(expected.points, len(way))
         true = np.concatenate(
@@ -184,11 +190,11 @@ def test_exact_surfaces_give_an_exact_path() -> None:
 @pytest.mark.long
 def test_what_an_uncertain_calibration_does_is_told() -> None:
     """Exact: nothing. 0.2 degrees and 30 um of each camera: tenths of a millimetre."""
-    maps, drawn = depth_maps(OUT), held(diamond(SIZE_PX))
+    maps, drawn = depth_maps(OUT), without_covariances(diamond(SIZE_PX))
     exact = track_surfaces(capture_of(drawn, tuple(OUT)), maps)
     assert "taken as exact" in exact.notes[0]
     assert exact.told_by == "poses alone"
-    nominal = NominalOptions().of(drawn).fill(drawn)
+    nominal = NominalOptions().for_handpiece(drawn).fill(drawn)
     told = track_surfaces(capture_of(nominal, tuple(OUT)), maps).notes[0]
     assert f"{depth_sigma_mm(nominal):.2g} mm" in told
     assert 0.03 < depth_sigma_mm(nominal) < 0.3

@@ -13,7 +13,7 @@ from cuspid.geometry import Rigid3, unit
 from cuspid.geometry.gloss import leaving
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Handpiece, Light
-from cuspid.mvs.glare import mirrored, seen
+from cuspid.mvs.glare import estimate_glare, mirror_reflections
 from cuspid.mvs.matching import DepthEstimator, StereoOptions
 from cuspid.mvs.shading import ShadingOptions
 from plain_scene import OPTIONS, errors_um, lit, of_one_frame, photographs, white
@@ -42,7 +42,7 @@ def brightest(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("x_mm", [-3.0, 0.0, 2.0])
 def test_a_spot_lies_where_the_surface_mirrors_the_light(x_mm: float) -> None:
     depth = cast_depth(BALL, GRID, Rigid3.identity())
-    spot = brightest(seen(GRID, depth, [led(x_mm)], 1.4).mirrored[..., 0])
+    spot = brightest(estimate_glare(GRID, depth, [led(x_mm)], 1.4).mirrored[..., 0])
     # Where the normal of the ball (centre at 7 mm) halves the angle between camera and light.
     rays = GRID.rays(GRID.pixel_centres().reshape(-1, 2)).reshape(60, 60, 3)
     points = rays * depth[..., None]
@@ -54,22 +54,22 @@ def test_a_spot_lies_where_the_surface_mirrors_the_light(x_mm: float) -> None:
 def test_spots_have_the_colour_of_their_lights_and_no_other_has_any() -> None:
     depth = cast_depth(BALL, GRID, Rigid3.identity())
     lights = [led(-3.0, colour=(1, 0, 0)), led(3.0, colour=(0, 1, 0))]
-    found = seen(GRID, depth, lights, 1.4).mirrored
+    found = estimate_glare(GRID, depth, lights, 1.4).mirrored
     assert brightest(found[..., 0])[1] < 30 < brightest(found[..., 1])[1]
     assert not found[..., 2].any()
-    assert not seen(GRID, depth, [], 1.4).mirrored.any()
+    assert not estimate_glare(GRID, depth, [], 1.4).mirrored.any()
 
 
 def test_reflections_go_with_the_share_that_passes_and_not_with_power_or_scale() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform([-2, -2, 4], [2, 2, 6], (50, 3))
     normals = unit(rng.normal([0, 0, -2], 0.5, (50, 3)))
-    one = mirrored(points, normals, [led(1.0)])
+    one = mirror_reflections(points, normals, [led(1.0)])
     assert one.max() > 0
-    assert mirrored(points, normals, [led(1.0, glare=0.06)]) == pytest.approx(2 * one)
-    assert mirrored(points, normals, [replace(led(1.0), power=7.0)]) == pytest.approx(one)
+    assert mirror_reflections(points, normals, [led(1.0, glare=0.06)]) == pytest.approx(2 * one)
+    assert mirror_reflections(points, normals, [replace(led(1.0), power=7.0)]) == pytest.approx(one)
     far = replace(led(1.0), position_mm=np.array([1000.0, 0, 0]))
-    assert mirrored(1000 * points, normals, [far]) == pytest.approx(one, rel=1e-6)
+    assert mirror_reflections(1000 * points, normals, [far]) == pytest.approx(one, rel=1e-6)
 
 
 def test_less_light_leaves_at_grazing_angles() -> None:
@@ -83,15 +83,15 @@ def test_less_light_leaves_at_grazing_angles() -> None:
 def test_a_pit_that_a_reflection_made_is_looked_past() -> None:
     """The first depth is wrong where a light is mirrored: that its slope hides the spot there is known."""
     depth = np.full((60, 60), 5.0)
-    clean = seen(GRID, depth, [led(0.0)], 1.4)
+    clean = estimate_glare(GRID, depth, [led(0.0)], 1.4)
     rows, columns = np.mgrid[:60, :60]
     away = (rows - 30) ** 2 + (columns - 30) ** 2
-    pit = seen(GRID, depth + 0.1 * np.exp(-away / 3), [led(0.0)], 1.4)
+    pit = estimate_glare(GRID, depth + 0.1 * np.exp(-away / 3), [led(0.0)], 1.4)
     most = clean.mirrored.max()
     assert pit.mirrored[away < 9].min() < 0.6 * most
     assert (pit.mirrored + 2 * pit.uncertain)[away < 9].min() > 0.7 * most
     assert clean.uncertain.max() < 0.25 * most
-    hole = seen(GRID, np.where(away < 2, np.nan, depth), [led(0.0)], 1.4)
+    hole = estimate_glare(GRID, np.where(away < 2, np.nan, depth), [led(0.0)], 1.4)
     assert hole.mirrored[30, 30, 0] > 0.8 * most
 
 
@@ -99,7 +99,7 @@ def test_finer_images_show_the_same_spots() -> None:
     def spots(fineness: int) -> np.ndarray:
         grid = Camera.from_field_of_view(60 * fineness, 60 * fineness, 60.0)
         depth = cast_depth(BALL, grid, Rigid3.identity())
-        found = seen(grid, depth, [led(1.0)], 1.4).mirrored[..., 0]
+        found = estimate_glare(grid, depth, [led(1.0)], 1.4).mirrored[..., 0]
         return found.reshape(60, fineness, 60, fineness).mean(axis=(1, 3))
 
     coarse, fine = spots(1), spots(4)

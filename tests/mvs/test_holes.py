@@ -82,7 +82,7 @@ def test_a_map_confirms_the_points_on_its_surface(off_mm: float, expected: int) 
     at_mm = found.rig["west"].cam_from_rig.apply(tracks.points)[:, 2]
     assert np.ptp(at_mm) < 1e-9
     maps = [plane(found, "00000", "west", at_mm[0] + off_mm)]
-    count = Sightings.of(found, tracks).confirmed(maps, found.rig_from_world, 0.08)
+    count = Sightings.of(found, tracks).count_confirmations(maps, found.rig_from_world, 0.08)
     assert (count == expected).all()
 
 
@@ -94,10 +94,10 @@ def test_maps_of_all_located_frames_count_whether_keypoints_were_found_there_or_
     depth = {name: found.rig[name].cam_from_rig.apply(tracks.points)[0, 2] for name in ("west", "east")}
     maps = [plane(found, frame, name, depth[name]) for frame in ("00000", "00001") for name in ("west", "east")]
     sightings = Sightings.of(found, tracks)
-    assert (sightings.confirmed(maps, found.rig_from_world, 0.08) == 4).all()
-    assert (sightings.confirmed(maps, {"00001": found.rig_from_world["00001"]}, 0.08) == 2).all()
+    assert (sightings.count_confirmations(maps, found.rig_from_world, 0.08) == 4).all()
+    assert (sightings.count_confirmations(maps, {"00001": found.rig_from_world["00001"]}, 0.08) == 2).all()
     aside = found.rig_from_world | {"00001": Rigid3(np.eye(3), np.array([50.0, 0, 0]))}
-    assert (sightings.confirmed(maps, aside, 0.08) == 2).all()
+    assert (sightings.count_confirmations(maps, aside, 0.08) == 2).all()
 
 
 def test_points_in_stereo_are_those_that_two_of_the_cameras_show() -> None:

@@ -283,7 +283,7 @@ def test_one_instant_refines_only_a_calibration_that_it_contradicts(tmp_path: Pa
         for name, each in handpiece.rig.cameras.items()
     }
     images = {("0", name): render(HILLS, each, Rigid3.identity(), rng) for name, each in built.items()}
-    nominal = NominalOptions().of(handpiece).fill(handpiece)
+    nominal = NominalOptions().for_handpiece(handpiece).fill(handpiece)
     capture = Capture(handpiece=nominal, frames=(Frame(name="0", cameras=nominal.rig.names),), source=InMemory(images))
     known, notes = _hold_what_fits(capture, True, tmp_path, ReconstructionOptions(), lambda *_: None)
     assert (known.handpiece.rig["east"].covariance is None) == held

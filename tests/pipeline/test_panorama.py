@@ -377,7 +377,7 @@ def test_the_height_map_follows_the_points_and_is_known_everywhere() -> None:
     top, gum = scale * np.array([[0.0, 30.0, -1.0], [0.0, 36.0, -5.0]]) @ rotation.T + shift
     surface = height_map(found, HeightMapOptions())
     assert np.isfinite(surface.heights).all()
-    heights = surface.at(np.array([[top[:2], gum[:2]]])).ravel()
+    heights = surface.interpolate(np.array([[top[:2], gum[:2]]])).ravel()
     np.testing.assert_allclose(heights, [top[2], gum[2]], atol=0.7)
 
 

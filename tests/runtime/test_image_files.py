@@ -20,9 +20,9 @@ from cuspid.runtime.image_files import (
     image_size,
     read_deep,
     read_image,
-    recorded,
     recorded_size,
     stretch_fine,
+    undo_exif_orientation,
     visible_in_8_bits,
 )
 
@@ -132,7 +132,7 @@ def test_sizes_are_those_of_the_upright_image(tmp_path: Path, name: str, orienta
     assert image_size(path) == upright.shape[1::-1]
     assert exif_orientation(path) == orientation
     assert recorded_size(path) == (40, 24)
-    back = recorded(upright, orientation)
+    back = undo_exif_orientation(upright, orientation)
     assert back.shape == COLOURS.shape
     if path.suffix != ".jpg":
         assert np.array_equal(back, COLOURS)

@@ -15,7 +15,7 @@ from cuspid.handpiece.designs import twelve_cameras
 from cuspid.model.capture import Frame
 from cuspid.model.rig import Rig
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import checked_name, covariance, number, numbers, shown, whole
+from cuspid.runtime.values import checked_name, covariance, number, numbers, quote, whole
 
 BAD_NAMES = [
     *("", ".", "..", "../../x", "/etc/x", "a//b", "a/", "a/../b", "C:x", "a\\b", " a", "a\n", "a\0", "a\x1b[2J"),
@@ -93,8 +93,8 @@ def test_a_covariance_is_one_at_any_scale(seed, scale):
 
 
 def test_long_values_are_cut_short():
-    assert len(shown("x" * 10_000)) == 40
-    assert "\n" not in shown(np.eye(30))
+    assert len(quote("x" * 10_000)) == 40
+    assert "\n" not in quote(np.eye(30))
 
 
 # --- a handpiece from outside -----------------------------------------------------------------------------------------

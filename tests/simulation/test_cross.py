@@ -62,14 +62,14 @@ def test_it_begins_and_ends_as_a_pass_comes_by(upper: Jaw, curve: ArchCurve, fro
     assert crossing.start_mm + crossing.end_mm == pytest.approx(length)
     assert min(crossing.start_mm, crossing.end_mm) < 0.2 * length
     for at, place in ((0.0, crossing.start_mm), (crossing.length_mm, crossing.end_mm)):
-        away, angle = apart(crossing.at(at), curve.rig_from_world(place))
+        away, angle = apart(crossing.pose_at(at), curve.rig_from_world(place))
         assert away < 1.5
         assert angle < 3
 
 
 def test_it_follows_the_surface_without_jumps_and_keeps_clear(upper: Jaw) -> None:
     crossing = crossing_of(upper)
-    poses = [crossing.at(float(at)) for at in np.linspace(0, crossing.length_mm, 150)]
+    poses = [crossing.pose_at(float(at)) for at in np.linspace(0, crossing.length_mm, 150)]
     heights = np.array([pose.inverse().translation[2] for pose in poses])
     assert heights[75] < heights[[0, -1]].min() - 3
     steps = np.array([apart(*pair) for pair in pairwise(poses)])
@@ -85,7 +85,7 @@ def test_it_goes_as_far_back_as_there_is_surface(upper: Jaw) -> None:
     short = crossing_of(with_palate(horseshoe(), 6.0, back_mm=-5.0))
     whole = crossing_of(upper)
     assert short.start_mm > whole.start_mm + 5
-    assert short.at(short.length_mm / 2).inverse().translation[1] > -6
+    assert short.pose_at(short.length_mm / 2).inverse().translation[1] > -6
 
 
 def test_a_single_camera_goes_across_too(upper: Jaw) -> None:

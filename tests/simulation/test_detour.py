@@ -13,7 +13,7 @@ from cuspid.handpiece.designs import essential_four, twelve_cameras
 from cuspid.model.body import Body, Box
 from cuspid.model.jaw import Jaw
 from cuspid.model.room import Room
-from cuspid.simulation.path.detour import repaired
+from cuspid.simulation.path.detour import repair_path
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path
 
 CUBE = Body({"cube": Box(Rigid3.identity(), np.array([1.0, 1.0, 1.0]))})
@@ -35,14 +35,14 @@ def away_mm(one: Rigid3, other: Rigid3) -> float:
 
 def test_frames_that_fit_are_left_as_they_are() -> None:
     poses = over_the_ball(np.full(12, 1.6))
-    assert all(found is pose for found, pose in zip(repaired(BALL, poses), poses, strict=True))
+    assert all(found is pose for found, pose in zip(repair_path(BALL, poses), poses, strict=True))
 
 
 def test_a_frame_that_nearly_fits_is_lifted_a_little_and_its_neighbours_with_it() -> None:
     heights = np.full(21, 1.6)
     heights[10] = 1.4
     poses = over_the_ball(heights)
-    found = repaired(BALL, poses)
+    found = repair_path(BALL, poses)
     moves = np.array([away_mm(*pair) for pair in zip(found, poses, strict=True)])
     assert BALL.clearance(poses[10])[0] < 0.5 <= min(BALL.clearance(pose)[0] for pose in found)
     assert 0.09 < moves[10] < 0.35
@@ -55,7 +55,7 @@ def test_a_large_repair_begins_before_it_is_needed() -> None:
     heights = np.full(21, 1.6)
     heights[10] = -1.4
     poses = over_the_ball(heights)
-    found = repaired(BALL, poses)
+    found = repair_path(BALL, poses)
     assert min(BALL.clearance(pose)[0] for pose in found) >= 0.5
     moves = np.array([away_mm(*pair) for pair in zip(found, poses, strict=True)])
     assert 2.5 < moves[10] < 4.5
@@ -70,14 +70,14 @@ def test_whatever_the_frames_all_fit_afterwards(seed: int) -> None:
     rng = np.random.default_rng(seed)
     poses = [any_pose(int(each), 9.0) for each in rng.integers(0, 10**6, 6)]
     far = [Rigid3(np.eye(3), np.array([0.0, 0.0, -14.0 - index])) for index in range(8)]
-    found = repaired(BALL, [*poses, *far])
+    found = repair_path(BALL, [*poses, *far])
     assert min(BALL.clearance(pose)[0] for pose in found) >= 0.5
     assert all(pose is untouched for pose, untouched in zip(found[-4:], far[-4:], strict=True))
 
 
 def test_where_nothing_else_fits_it_goes_straight_out() -> None:
     room, inside = Room(sphere(40.0), CUBE, 0.5), any_pose(3, 1.0)
-    (found,) = repaired(room, [inside])
+    (found,) = repair_path(room, [inside])
     assert room.clearance(found)[0] >= 0.5
     np.testing.assert_allclose(found.rotation, inside.rotation, atol=1e-9)
     way = found.inverse().translation - inside.inverse().translation

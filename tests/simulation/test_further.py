@@ -74,7 +74,7 @@ def test_a_path_around_an_obstacle_fits_and_still_sees(
     """The handpiece is to keep more room than there is."""
     room, span = Room(coarse_phantom.mesh, HANDPIECE.solid, 4.3), (24.0, 36.0)
     detour = plan_detour(room, crowns, HANDPIECE, curve.rig_from_world, span)
-    poses = [detour.at(float(at)) @ curve.rig_from_world(float(at)) for at in detour.travel_mm]
+    poses = [detour.changed_from_rig(float(at)) @ curve.rig_from_world(float(at)) for at in detour.travel_mm]
     steady = [curve.rig_from_world(float(at)) for at in detour.travel_mm]
     assert min(room.clearance(pose)[0] for pose in steady) < 4.2
     assert min(room.clearance(pose)[0] for pose in poses) > 4.25

@@ -11,9 +11,9 @@ from cuspid.model.camera import Camera
 from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.simulation.appearance import APPEARANCES
-from cuspid.simulation.hits import Rays, ShadedMesh, first_hits, traced
+from cuspid.simulation.hits import Rays, ShadedMesh, first_hits, trace
 from cuspid.simulation.raycast import Scene, lamps, pixel_rays
-from cuspid.simulation.shadows import illuminated, segments
+from cuspid.simulation.shadows import illuminate, segments
 
 SAMPLES = 4
 HANDPIECE = twelve_cameras(DesignOptions(width_px=200, height_px=200))
@@ -53,7 +53,7 @@ def view(jaw: Jaw, name: str, tooth: int) -> tuple[ShadedMesh, np.ndarray, np.nd
 
 def all_traced(mesh: Mesh, origins: np.ndarray, rays: np.ndarray) -> tuple[Rays, Rays]:
     """All rays, and the first ones of the pixels."""
-    return traced(mesh, origins, rays), traced(mesh, origins, rays[::SAMPLES])
+    return trace(mesh, origins, rays), trace(mesh, origins, rays[::SAMPLES])
 
 
 @pytest.mark.parametrize(("name", "tooth"), VIEWS)
@@ -65,9 +65,9 @@ def test_rays_that_are_not_traced_hit_what_they_would_hit(
     if not one_origin:
         origins = np.tile(origins, (len(rays), 1))
     mesh = counted(coarse_phantom.mesh)
-    firsts = traced(mesh, origins[:: SAMPLES if len(origins) > 1 else 1], rays[::SAMPLES])
+    firsts = trace(mesh, origins[:: SAMPLES if len(origins) > 1 else 1], rays[::SAMPLES])
     found = first_hits(mesh, surface, origins, rays, firsts, SAMPLES, camera.width)
-    expected = traced(coarse_phantom.mesh, origins, rays)
+    expected = trace(coarse_phantom.mesh, origins, rays)
     same = found.faces == expected.faces
     assert same.mean() > 0.9995
     hit = same & (found.faces >= 0)
@@ -83,7 +83,7 @@ def test_shadows_that_are_not_traced_are_where_they_would_be(coarse_phantom: Jaw
     lights = lamps(HANDPIECE, None, pose)
     everything, firsts = all_traced(coarse_phantom.mesh, origins, rays)
     mesh = counted(coarse_phantom.mesh)
-    chosen, counts, light = illuminated(mesh, surface, everything, SAMPLES, lights, firsts, camera.width)
+    chosen, counts, light = illuminate(mesh, surface, everything, SAMPLES, lights, firsts, camera.width)
     assert counts.sum() == len(rays)
     first = everything.faces[chosen] >= 0
     points = everything.origins + everything.distances[chosen, None] * everything.directions[chosen]

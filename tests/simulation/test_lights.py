@@ -9,7 +9,7 @@ import pytest
 
 from cuspid.handpiece.designs import DesignOptions, essential_four
 from cuspid.pipeline import scan as pipeline
-from cuspid.simulation.lights import lit
+from cuspid.simulation.lights import with_default_lights
 from cuspid.simulation.optics import OpticsOptions
 from cuspid.simulation.path.scan import ScanPathOptions, steady_poses
 
@@ -19,7 +19,7 @@ DARK = dataclasses.replace(FOUR, lights={}, lightings=())
 
 def test_each_camera_gets_a_light_beside_it(caplog):
     with caplog.at_level("INFO", logger="cuspid"):
-        shining = lit(DARK)
+        shining = with_default_lights(DARK)
     assert tuple(shining.lights) == DARK.rig.names
     for name, mounted in DARK.rig.cameras.items():
         light = shining.lights[name]
@@ -30,7 +30,7 @@ def test_each_camera_gets_a_light_beside_it(caplog):
 
 
 def test_known_lights_are_left_alone(caplog):
-    assert lit(FOUR) is FOUR
+    assert with_default_lights(FOUR) is FOUR
     assert not caplog.messages
 
 

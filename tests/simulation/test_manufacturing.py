@@ -7,8 +7,8 @@ import pytest
 
 from cuspid import storage
 from cuspid.handpiece.designs import DesignOptions, essential_four, twelve_cameras
-from cuspid.model.tolerances import EXACT, NominalOptions, held, is_nominal
-from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
+from cuspid.model.tolerances import EXACT, NominalOptions, is_nominal, without_covariances
+from cuspid.simulation.manufacturing import ManufacturingOptions, sample_built, with_tolerances
 from cuspid.simulation.path.scan import ScanPathOptions
 from cuspid.simulation.stage import SimulationOptions, simulate
 
@@ -23,8 +23,10 @@ ROUGH = ManufacturingOptions(
 
 def test_without_tolerances_it_is_the_drawn_one():
     drawn = twelve_cameras(DesignOptions())
-    assert all(built(drawn, ManufacturingOptions()).rig[name] is each for name, each in drawn.rig.cameras.items())
-    for mounted in told(drawn, ManufacturingOptions()).rig.cameras.values():
+    assert all(
+        sample_built(drawn, ManufacturingOptions()).rig[name] is each for name, each in drawn.rig.cameras.items()
+    )
+    for mounted in with_tolerances(drawn, ManufacturingOptions()).rig.cameras.values():
         assert not mounted.covariance.any()
         assert not mounted.camera.covariance.any()
 
@@ -32,24 +34,24 @@ def test_without_tolerances_it_is_the_drawn_one():
 def test_what_is_not_manufactured_anew_stays_as_well_known_as_it_was():
     """A calibrated handpiece, of which only the places are off in a simulation."""
     calibrated = ROUGH.tolerances.fill(essential_four(DesignOptions()))
-    for name, mounted in told(calibrated, ManufacturingOptions(manufacturing_um=77.0)).rig.cameras.items():
+    for name, mounted in with_tolerances(calibrated, ManufacturingOptions(manufacturing_um=77.0)).rig.cameras.items():
         assert np.array_equal(mounted.camera.covariance, calibrated.rig[name].camera.covariance)
         assert np.allclose(np.diag(mounted.covariance), [0, 0, 0, *[77e-3**2] * 3])
 
 
 def test_only_what_nobody_has_said_is_assumed():
     drawn = essential_four(DesignOptions())
-    assumed = NominalOptions(place_um=40.0).of(drawn).fill(drawn)
+    assumed = NominalOptions(place_um=40.0).for_handpiece(drawn).fill(drawn)
     assert is_nominal(drawn)
     assert not is_nominal(assumed)
     for given in (EXACT.fill(drawn), ROUGH.tolerances.fill(drawn)):
         assert not is_nominal(given)
-        for name, mounted in NominalOptions().of(given).fill(given).rig.cameras.items():
+        for name, mounted in NominalOptions().for_handpiece(given).fill(given).rig.cameras.items():
             assert mounted is given.rig[name]
     for name, mounted in assumed.rig.cameras.items():
         assert np.allclose(np.sqrt(np.diag(mounted.covariance)), [*[np.deg2rad(0.2)] * 3, *[0.04] * 3])
         assert np.array_equal(mounted.cam_from_rig.matrix, drawn.rig[name].cam_from_rig.matrix)
-    assert is_nominal(held(assumed))
+    assert is_nominal(without_covariances(assumed))
 
 
 @pytest.mark.parametrize("factor", [0.1, 100.0])
@@ -61,16 +63,18 @@ def test_a_handpiece_of_another_size_is_as_well_known_for_its_size(factor):
         working_distance_mm=factor * drawn.working_distance_mm,
         depth_range_mm=(factor * near, factor * far),
     )
-    assert NominalOptions().of(larger).place_mm == pytest.approx(factor * NominalOptions().of(drawn).place_mm)
+    assert NominalOptions().for_handpiece(larger).place_mm == pytest.approx(
+        factor * NominalOptions().for_handpiece(drawn).place_mm
+    )
 
 
 def test_what_is_built_is_off_by_what_the_tolerances_say():
     """In the standard deviations of the covariances, each number for itself, over fifty handpieces."""
     drawn = twelve_cameras(DesignOptions())
-    known = told(drawn, ROUGH)
+    known = with_tolerances(drawn, ROUGH)
     places, lenses = [], []
     for seed in range(50):
-        true = built(drawn, ManufacturingOptions(**{**vars(ROUGH), "manufacturing_seed": seed}))
+        true = sample_built(drawn, ManufacturingOptions(**{**vars(ROUGH), "manufacturing_seed": seed}))
         for name, mounted in known.rig.cameras.items():
             motion = true.rig[name].cam_from_rig @ mounted.cam_from_rig.inverse()
             places.append([*motion.rotation_vector, *motion.translation] / np.sqrt(np.diag(mounted.covariance)))
@@ -85,8 +89,8 @@ def test_what_is_built_is_off_by_what_the_tolerances_say():
 
 def test_another_seed_is_another_handpiece_and_the_same_one_the_same():
     drawn = essential_four(DesignOptions())
-    once, again = built(drawn, ROUGH), built(drawn, ROUGH)
-    other = built(drawn, ManufacturingOptions(**{**vars(ROUGH), "manufacturing_seed": 1}))
+    once, again = sample_built(drawn, ROUGH), sample_built(drawn, ROUGH)
+    other = sample_built(drawn, ManufacturingOptions(**{**vars(ROUGH), "manufacturing_seed": 1}))
     for name in drawn.rig.names:
         assert np.array_equal(once.rig[name].cam_from_rig.matrix, again.rig[name].cam_from_rig.matrix)
         assert not np.array_equal(once.rig[name].cam_from_rig.matrix, other.rig[name].cam_from_rig.matrix)

@@ -146,7 +146,9 @@ def test_stippling_looks_as_if_the_surface_had_that_height(scattering: float, mo
         look = replace(APPEARANCES["natural"], gum=replace(matte, stipple_mm=stipple_mm))
         optics = Optics(scattering=scattering)
         scene = Scene(jaw=jaw, handpiece=lit(), appearance=look, supersampling=1, optics=optics)
-        return scene, radiance(scene, camera.camera, camera.cam_from_rig @ pose, lights, scene.below("all", pose))
+        return scene, radiance(
+            scene, camera.camera, camera.cam_from_rig @ pose, lights, scene.light_from_below("all", pose)
+        )
 
     down = plate(0.0, 3.0, 150)
     flat = Mesh(down.vertices, down.faces[:, ::-1])

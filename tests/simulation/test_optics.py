@@ -12,8 +12,8 @@ from cuspid.model.camera import Camera
 from cuspid.model.capture import Frame
 from cuspid.runtime.errors import InputError
 from cuspid.simulation.appearance import APPEARANCES
-from cuspid.simulation.optics import CLINICAL, IDEAL, Optics, OpticsOptions, mixed, recorded, through_lens
-from cuspid.simulation.raycast import Scene, motions, render_image, smeared
+from cuspid.simulation.optics import CLINICAL, IDEAL, Optics, OpticsOptions, encode_image, mix_channels, through_lens
+from cuspid.simulation.raycast import Scene, limit_motion, motions, render_image
 from ray_scenes import CAMERA, jaw_of, led, probe, quad
 
 SMALL = Camera.from_field_of_view(61, 61, 60.0)
@@ -35,12 +35,12 @@ def width_px(image: np.ndarray) -> float:
 
 
 def test_each_option_overrides_the_preset() -> None:
-    assert OpticsOptions().settled == IDEAL
-    assert OpticsOptions(optics="clinical").settled == CLINICAL
-    assert OpticsOptions(optics="clinical", bayer=False, smear_mm=0.0).settled == replace(
+    assert OpticsOptions().resolved == IDEAL
+    assert OpticsOptions(optics="clinical").resolved == CLINICAL
+    assert OpticsOptions(optics="clinical", bayer=False, smear_mm=0.0).resolved == replace(
         CLINICAL, bayer=False, smear_mm=0.0
     )
-    assert OpticsOptions(aperture_mm=0.1).settled == replace(IDEAL, aperture_mm=0.1)
+    assert OpticsOptions(aperture_mm=0.1).resolved == replace(IDEAL, aperture_mm=0.1)
     with pytest.raises(InputError, match=r"optics: --crosstalk is 0\.5"):
         OpticsOptions(crosstalk=0.5)
 
@@ -73,19 +73,19 @@ def test_a_lens_keeps_even_light_and_does_not_spread_what_is_hidden() -> None:
 
 def test_crosstalk_mixes_colours_and_keeps_grey() -> None:
     some = Optics(crosstalk=0.1)
-    assert mixed(np.array([[[1.0, 0.0, 0.0]]]), some)[0, 0] == pytest.approx([0.8, 0.1, 0.1])
-    assert mixed(np.full((1, 1, 3), 0.3), some) == pytest.approx(0.3)
+    assert mix_channels(np.array([[[1.0, 0.0, 0.0]]]), some)[0, 0] == pytest.approx([0.8, 0.1, 0.1])
+    assert mix_channels(np.full((1, 1, 3), 0.3), some) == pytest.approx(0.3)
 
 
 def test_colour_filters_and_compression_keep_what_is_smooth() -> None:
     rows, columns = np.mgrid[:64, :64]
     smooth = np.dstack([80 + rows, 200 - columns, 60 + (rows + columns) // 2]).astype(np.uint8)
     for optics in (Optics(bayer=True), Optics(jpeg_quality=95), CLINICAL):
-        off = recorded(smooth, optics)[4:-4, 4:-4].astype(float) - smooth[4:-4, 4:-4]
+        off = encode_image(smooth, optics)[4:-4, 4:-4].astype(float) - smooth[4:-4, 4:-4]
         assert np.abs(off).max() <= 4
         assert np.abs(off.mean(axis=(0, 1))).max() < 1
     fine = np.where((rows + columns)[..., None] % 2 == 0, [200, 40, 40], [40, 40, 200]).astype(np.uint8)
-    assert np.abs(recorded(fine, Optics(bayer=True)).astype(float) - fine).mean() > 20
+    assert np.abs(encode_image(fine, Optics(bayer=True)).astype(float) - fine).mean() > 20
 
 
 def test_the_handpiece_moves_from_frame_to_frame_and_smears_by_a_share_of_it() -> None:
@@ -94,12 +94,12 @@ def test_the_handpiece_moves_from_frame_to_frame_and_smears_by_a_share_of_it() -
     found = motions(frames, poses)
     for name, motion in found.items():
         assert motion == pytest.approx([0, 0, 0, -0.5, 0.1, 0])
-        smear = smeared(motion, poses[name], 0.02)
+        smear = limit_motion(motion, poses[name], 0.02)
         assert np.linalg.norm(smear[3:]) == pytest.approx(0.02)
         assert smear[3:5] / np.linalg.norm(smear[3:5]) == pytest.approx(np.array([-5, 1]) / np.sqrt(26))
     still = motions(frames, dict.fromkeys(poses, Rigid3.identity()))
     assert not any(motion.any() for motion in still.values())
-    assert not smeared(still["a"], Rigid3.identity(), 0.02).any()
+    assert not limit_motion(still["a"], Rigid3.identity(), 0.02).any()
 
 
 def test_motion_blurs_across_it_and_not_along() -> None:

@@ -230,7 +230,7 @@ def test_jitter_has_the_asked_deviation_and_is_smooth() -> None:
     np.testing.assert_allclose(hand.drift[:, 3:].std(axis=0), 0.2, rtol=0.1)
     np.testing.assert_allclose(np.rad2deg(hand.drift[:, :3].std(axis=0)), 1.0, rtol=0.1)
     step = 1.0
-    places = np.array([hand.at(length).translation for length in np.arange(0, 3000, step)])
+    places = np.array([hand.jittered_from_rig(length).translation for length in np.arange(0, 3000, step)])
     change = np.diff(places, axis=0).std()
     assert 0.02 < change < 0.2 * np.sqrt(2) * 0.4, "white noise would change by sqrt(2) of its deviation"
 
@@ -275,7 +275,7 @@ def test_one_turn_is_the_path_along_the_curve_to_the_last_bit(coarse_phantom: Ja
     stretch = (start + end) / 2 - 4.5, (start + end) / 2 + 4.5
     hand = hand_of(options, stretch)
     for name, at in (("00000", stretch[0]), ("00009", stretch[1])):
-        expected = hand.at(at) @ curve.rig_from_world(at)
+        expected = hand.jittered_from_rig(at) @ curve.rig_from_world(at)
         np.testing.assert_array_equal(path.rig_from_world[name].matrix, expected.matrix)
 
 

@@ -70,7 +70,7 @@ def test_degenerate_faces_and_lone_vertices_do_no_harm() -> None:
 def photographs(scattering: float) -> dict[str, np.ndarray]:
     """Of plain hills, seen by four cameras."""
     frames, poses = lit_frames(lit(), {"0": Rigid3.identity()})
-    optics = OpticsOptions(scattering=scattering).settled
+    optics = OpticsOptions(scattering=scattering).resolved
     jaw, look = Jaw(mesh=HILLS), APPEARANCES["enamel"]
     scene = Scene(jaw=jaw, handpiece=lit(), appearance=look, supersampling=1, optics=optics)
     gain = auto_gain(scene, list(poses.values()), frames[0].lighting)

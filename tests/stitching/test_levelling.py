@@ -10,9 +10,9 @@ from hypothesis import given
 from scipy.spatial import KDTree
 
 from cuspid.geometry import Rigid3
-from cuspid.model.occlusal_plane import crown_tips, crown_tops, levelled, upright
+from cuspid.model.occlusal_plane import crown_tips, crown_tops, level_crowns, upright
 from cuspid.stitching.height_map import HeightMap
-from cuspid.stitching.levelling import level_by_crowns, turned
+from cuspid.stitching.levelling import level_by_crowns, tilt_surface
 from strategies import vectors
 
 CELL_MM = 0.2
@@ -70,7 +70,7 @@ def test_a_tilted_surface_is_levelled(world_from_new: Rigid3):
     # What is known before holds back less than an eighth.
     assert angle_degrees(level.rotation[2], world_from_new.rotation[2]) < 0.1 + world_from_new.angle_deg / 8
     assert np.all(level.translation == 0)
-    unprejudiced = levelled(lambda turn: known_places(turned(surface, turn)), CELL_MM, 90.0)
+    unprejudiced = level_crowns(lambda turn: known_places(tilt_surface(surface, turn)), CELL_MM, 90.0)
     assert angle_degrees(unprejudiced.rotation[2], world_from_new.rotation[2]) < 0.15
 
 
@@ -78,13 +78,13 @@ def test_a_tilted_surface_is_levelled(world_from_new: Rigid3):
 @tilts
 def test_a_turned_surface_lies_where_it_lay(world_from_new: Rigid3):
     tilted, upright_there = seen_from(world_from_new), seen_from(Rigid3.identity())
-    back = turned(tilted, world_from_new)
+    back = tilt_surface(tilted, world_from_new)
     inside = back.known & (np.abs(back.places[..., :2]) < 28).all(axis=-1)
-    off = back.heights - upright_there.at(back.places[..., :2])
+    off = back.heights - upright_there.interpolate(back.places[..., :2])
     assert inside.sum() > 10_000
     assert np.percentile(np.abs(off[inside]), 99) < 0.02
     assert np.abs(off[inside]).max() < 0.15
-    assert np.abs(turned(tilted, Rigid3.identity()).heights - tilted.heights).max() < 1e-5
+    assert np.abs(tilt_surface(tilted, Rigid3.identity()).heights - tilted.heights).max() < 1e-5
 
 
 def test_what_is_not_known_stays_unknown_and_is_no_tip():
@@ -97,7 +97,7 @@ def test_what_is_not_known_stays_unknown_and_is_no_tip():
         known=surface.known & ~peak,
     )
     assert angle_degrees(level_by_crowns(spoilt).rotation[2], np.array([0, 0, 1.0])) < 0.15
-    assert not turned(spoilt, tilt(2, 30)).known_at(np.array([[[0.0, -20.0]]])).any()
+    assert not tilt_surface(spoilt, tilt(2, 30)).known_at(np.array([[[0.0, -20.0]]])).any()
 
 
 def test_tips_are_the_highest_of_their_surroundings_and_lie_on_the_tops_of_crowns():

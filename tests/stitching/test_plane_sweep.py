@@ -24,8 +24,8 @@ from cuspid.stitching.height_map import (
     HeightMapOptions,
     ScaleOptions,
     height_map,
-    transformed,
-    uncovered,
+    lower_false_rises,
+    transform_model,
 )
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.ortho import OrthoOptions, Shown, find_surface, find_surface_again
@@ -117,10 +117,10 @@ def grid(x: tuple[float, float], y: tuple[float, float] = (-7.0, 2.5)) -> np.nda
 
 @pytest.mark.long
 def test_the_step_is_found_where_it_is(surface: HeightMap) -> None:
-    top, floor = surface.at(grid((-2.3, 2.3))), surface.at(grid((4.2, 6.0)))
+    top, floor = surface.interpolate(grid((-2.3, 2.3))), surface.interpolate(grid((4.2, 6.0)))
     assert np.percentile(np.abs(top), 95) < 0.15
     assert np.percentile(np.abs(floor + DEEP_MM), 90) < 0.3
-    high = surface.at(grid((-5, 5))) > -DEEP_MM / 2
+    high = surface.interpolate(grid((-5, 5))) > -DEEP_MM / 2
     assert np.median(high.sum(axis=1)) * 0.1 == pytest.approx(2 * HALF_MM, abs=0.6)
 
 
@@ -134,10 +134,10 @@ def test_from_a_surface_that_is_a_little_off_the_true_one_is_found_again(
     again = scene.swept(start=(replace(surface, heights=surface.heights + off), off_mm))
     assert again is not None
     assert np.array_equal(again.known, surface.known)
-    top, before = again.at(grid((-2.3, 2.3))), surface.at(grid((-2.3, 2.3)))
+    top, before = again.interpolate(grid((-2.3, 2.3))), surface.interpolate(grid((-2.3, 2.3)))
     assert np.percentile(np.abs(top), 95) < 0.15
     assert np.percentile(np.abs(top - before), 95) < 0.1
-    floor = again.at(grid((4.2, 6.0)))
+    floor = again.interpolate(grid((4.2, 6.0)))
     assert np.percentile(np.abs(floor + DEEP_MM), 90) < 0.3
 
 
@@ -148,7 +148,7 @@ def test_a_better_path_lies_where_the_one_before_lay(scene: Scene, metric: bool)
     beside = frames_beside(scene.motion, 0.2) if metric else None
     shown = find_surface(scene.motion, scene.read, options, beside=beside, working_distance_mm=14.0)
     elsewhere = Rigid3.from_rotation_vector(np.array([0.3, -0.8, 2.0]), np.array([9.0, -4.0, 30.0]))
-    moved = transformed(scene.motion.scaled(1.03), elsewhere)
+    moved = transform_model(scene.motion.scaled(1.03), elsewhere)
     again = find_surface_again(shown, moved, scene.read, options, beside=beside)
     kept = 1.03 if metric else 1.0
     if not metric:
@@ -215,8 +215,8 @@ def test_cameras_of_one_instant_find_the_step_however_bright_they_show_it(scene:
     sparse = height_map(scene.motion, HeightMapOptions())
     found = plane_sweep(scene.motion, compared, sparse, read, PlaneSweepOptions())
     assert found is not None
-    assert np.percentile(np.abs(found.at(grid((-2.3, 2.3)))), 95) < 0.15
-    assert np.percentile(np.abs(found.at(grid((4.2, 6.0))) + DEEP_MM), 90) < 0.4
+    assert np.percentile(np.abs(found.interpolate(grid((-2.3, 2.3)))), 95) < 0.15
+    assert np.percentile(np.abs(found.interpolate(grid((4.2, 6.0))) + DEEP_MM), 90) < 0.4
 
 
 def test_a_plain_spot_in_a_crown_is_bridged(scene: Scene) -> None:
@@ -231,7 +231,7 @@ def test_a_plain_spot_in_a_crown_is_bridged(scene: Scene) -> None:
     assert found is not None
     inside = grid((-1.2, 1.2), (-4.2, -1.8))
     assert found.known_at(inside).all()
-    assert np.abs(found.at(inside)).max() < 0.2
+    assert np.abs(found.interpolate(inside)).max() < 0.2
 
 
 @pytest.mark.long
@@ -240,7 +240,7 @@ def test_highlights_that_go_along_with_the_camera_do_not_raise_the_surface(scene
     lit = {name: cv2.circle(image.copy(), (120, 90), 8, (255, 255, 255), -1) for name, image in scene.images.items()}
     found = scene._replace(images=lit).swept()
     assert found is not None
-    assert np.percentile(np.abs(found.at(grid((-2.3, 2.3)))), 95) < 0.25
+    assert np.percentile(np.abs(found.interpolate(grid((-2.3, 2.3)))), 95) < 0.25
 
 
 @pytest.mark.long
@@ -251,7 +251,7 @@ def test_distortion_is_taken_out(scene: Scene, surface: HeightMap) -> None:
     found = Scene(replace(scene.motion, camera=bent), images).swept()
     assert found is not None
     middle = grid((-2.3, 2.3))
-    assert np.median(np.abs(found.at(middle) - surface.at(middle))) < 0.05
+    assert np.median(np.abs(found.interpolate(middle) - surface.interpolate(middle))) < 0.05
 
 
 @pytest.mark.long
@@ -380,13 +380,13 @@ def test_a_false_rise_in_the_middle_of_a_crown_occludes_nothing_but_a_crown_occl
     middle, centre = np.array([[[2.0, 0.5, 0.0]]]), np.array([4.0, 2.0, CAMERA_MM])
     assert false.occludes(middle, centre).all()
     sparse = height_map(scene.motion, HeightMapOptions())
-    assert not uncovered(false, sparse, scene.motion).occludes(middle, centre).any()
+    assert not lower_false_rises(false, sparse, scene.motion).occludes(middle, centre).any()
     behind = np.array([[[-HALF_MM - 0.7, 0.0, -DEEP_MM]]])
-    assert uncovered(surface, sparse, scene.motion).occludes(behind, np.array([3.0, 0, CAMERA_MM])).all()
+    assert lower_false_rises(surface, sparse, scene.motion).occludes(behind, np.array([3.0, 0, CAMERA_MM])).all()
     # The same a few millimetres lower: not on a crown any more, however near the smooth surface lies.
     low = replace(false, heights=false.heights - np.float32(3.5))
     deep = replace(sparse, heights=sparse.heights - np.float32(3.5))
-    assert uncovered(low, deep, scene.motion).occludes(middle - [0, 0, 3.5], centre).all()
+    assert lower_false_rises(low, deep, scene.motion).occludes(middle - [0, 0, 3.5], centre).all()
 
 
 @given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
@@ -456,7 +456,7 @@ def off_hill(scene: Scene, **changes: object) -> np.ndarray:
     assert found is not None
     flanks = np.concatenate([grid((-4.0, -1.5), (-4.0, 4.0)), grid((1.5, 4.0), (-4.0, 4.0))], axis=1)
     assert found.known_at(flanks).mean() > 0.95
-    return found.at(flanks) - hill(flanks[..., 0])
+    return found.interpolate(flanks) - hill(flanks[..., 0])
 
 
 def shaded(places: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from cuspid.cli.panorama import clear
 from cuspid.model.jaw import Jaw
 from cuspid.model.panorama import Panorama
 from cuspid.runtime.errors import InputError
-from cuspid.stitching.rescaling import MeasuredDistance, rescaled
+from cuspid.stitching.rescaling import MeasuredDistance, rescale_panorama
 from panoramas import HEIGHT, WIDTH, known_film, score, stitched_panorama, write_stitched
 from verbs import refused, run
 
@@ -46,7 +46,7 @@ def test_every_length_becomes_that_of_the_measurement(
     mm: float, before: float | None, one: tuple[float, float], other: tuple[float, float]
 ) -> None:
     shown = stitched_panorama(mm_per_px=before)
-    found = rescaled(shown, [distance(*FAR, mm)])
+    found = rescale_panorama(shown, [distance(*FAR, mm)])
     assert apart(found.panorama, np.array(FAR)) == pytest.approx(mm, rel=1e-5)
     assert found.lengths_mm == pytest.approx([mm])
     elsewhere = np.array([one, other])
@@ -57,8 +57,8 @@ def test_every_length_becomes_that_of_the_measurement(
 
 @given(SCALES, SCALES)
 def test_what_the_scale_was_before_does_not_matter(one: float, other: float) -> None:
-    first = rescaled(stitched_panorama(), [distance(*FAR, one)]).panorama
-    again, at_once = (rescaled(each, [distance(*FAR, other)]).panorama for each in (first, stitched_panorama()))
+    first = rescale_panorama(stitched_panorama(), [distance(*FAR, one)]).panorama
+    again, at_once = (rescale_panorama(each, [distance(*FAR, other)]).panorama for each in (first, stitched_panorama()))
     assert again.mm_per_px == pytest.approx(at_once.mm_per_px, rel=1e-5)
     np.testing.assert_allclose(again.height_mm, at_once.height_mm, rtol=1e-5)
 
@@ -70,7 +70,7 @@ def test_of_several_distances_the_scale_suits_all(factor: float, off: float) -> 
     near = np.array([[20.0, 3.0], [22.0, 27.0]])
     lengths = np.array([apart(shown, np.array(FAR)), apart(shown, near)])
     measured = factor * lengths * [1 + off, 1]
-    found = rescaled(shown, [distance(*FAR, measured[0]), distance(*near, measured[1])])
+    found = rescale_panorama(shown, [distance(*FAR, measured[0]), distance(*near, measured[1])])
     least = np.sum((found.lengths_mm - measured) ** 2)
     for step in (0.999, 1.001):
         assert np.sum((step * found.lengths_mm - measured) ** 2) >= least
@@ -82,19 +82,19 @@ def test_the_notes_tell_where_the_scale_is_from_and_what_does_not_fit() -> None:
     shown = stitched_panorama()
     near = np.array([[20.0, 3.0], [22.0, 27.0]])
     lengths = [apart(shown, np.array(FAR)), apart(shown, near)]
-    fits = rescaled(shown, [distance(*FAR, 2 * lengths[0]), distance(*near, 2.04 * lengths[1])]).panorama.notes
+    fits = rescale_panorama(shown, [distance(*FAR, 2 * lengths[0]), distance(*near, 2.04 * lengths[1])]).panorama.notes
     assert "smaller by a factor of 2.0" in fits[0]
     assert fits[1:] == ("the path is held loosely at frame 7",)
-    off = rescaled(shown, [distance(*FAR, 2 * lengths[0]), distance(*near, 3 * lengths[1])]).panorama.notes
+    off = rescale_panorama(shown, [distance(*FAR, 2 * lengths[0]), distance(*near, 3 * lengths[1])]).panorama.notes
     assert sum("look whether the places" in note for note in off) == 2
-    larger = rescaled(shown, [distance(*FAR, lengths[0] / 1.25)]).panorama.notes[0]
+    larger = rescale_panorama(shown, [distance(*FAR, lengths[0] / 1.25)]).panorama.notes[0]
     assert "larger by a factor of 1.2500" in larger
     assert f"is {100 * 0.1 / (lengths[0] / 1.25):.2g} % of all lengths" in larger
 
 
 def test_without_heights_places_count_as_level_and_that_is_said() -> None:
     flat = replace(stitched_panorama(), height_mm=None)
-    found = rescaled(flat, [distance((10, 10), (30, 10), 40.0)])
+    found = rescale_panorama(flat, [distance((10, 10), (30, 10), 40.0)])
     assert found.panorama.mm_per_px == pytest.approx(2.0)
     assert any("no heights" in note for note in found.panorama.notes)
 
@@ -114,7 +114,7 @@ def test_places_that_tell_nothing_are_refused(first, second, told: str) -> None:
     covered, height = np.array(shown.covered), np.array(shown.height_mm)
     covered[6, 5], height[6, 8] = False, np.nan
     with pytest.raises(InputError, match=r".*") as caught:
-        rescaled(replace(shown, covered=covered, height_mm=height), [distance(first, second, 10.0)])
+        rescale_panorama(replace(shown, covered=covered, height_mm=height), [distance(first, second, 10.0)])
     assert told in str(caught.value)
 
 
@@ -128,7 +128,7 @@ def test_the_scale_of_a_film_becomes_true(coarse_phantom: Jaw) -> None:
     ends = np.array([[columns[each] + 0.5, rows[each] + 0.5] for each in (left, right)])
     mm = float(np.linalg.norm(np.diff(true.world_from_pixels(ends), axis=0)))
     assert score(known, wrong).geometry.scale_error_pct == pytest.approx(100 / 1.07 - 100, abs=0.1)
-    found = score(known, rescaled(wrong, [distance(*ends, mm)]).panorama)
+    found = score(known, rescale_panorama(wrong, [distance(*ends, mm)]).panorama)
     assert abs(found.geometry.scale_error_pct) < 0.05
     assert found.geometry.median_mm < 1e-3
 

@@ -17,7 +17,7 @@ from cuspid.model.jaw import Jaw
 from cuspid.pipeline.scan import RenderOptions, take_images
 from cuspid.runtime.errors import InputError, OutputError
 from cuspid.storage.captures import hash_capture
-from cuspid.storage.stages import RECORD, Stage, _installed, code_version
+from cuspid.storage.stages import RECORD, Stage, _installed_code, code_version
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def test_the_version_of_the_code_tells_its_parts_apart() -> None:
 
 @pytest.mark.parametrize("stage", ["footage", "motion", "simulation", "mvs", "fusion"])
 def test_a_stage_depends_on_what_it_uses_and_not_on_what_stands_above_it(stage: str) -> None:
-    used = _installed().modules([f"cuspid.{stage}.stage"])
+    used = _installed_code().modules([f"cuspid.{stage}.stage"])
     assert f"cuspid.{stage}.stage" in used
     assert len(used) > 20
     above = ("cuspid.cli", "cuspid.pipeline", "cuspid.studies", "cuspid.report")

@@ -21,7 +21,7 @@ from cuspid.studies.camera_pair import (
 from cuspid.studies.matching_noise import (
     MatchingNoiseOptions,
     MatchingSamples,
-    binned,
+    bin_samples,
     fit_noise,
     sample_matching,
 )
@@ -180,7 +180,7 @@ def test_the_fit_finds_the_law_that_made_the_samples(sigma, doubling):
     samples = MatchingSamples(
         convergence_deg=np.zeros(60_000), deformation=deformation, error_px=deviation * rng.standard_normal(60_000)
     )
-    found = fit_noise(binned(samples, np.linspace(0, 1, 21).tolist()))
+    found = fit_noise(bin_samples(samples, np.linspace(0, 1, 21).tolist()))
     assert found.sigma_px == pytest.approx(sigma, rel=0.1)
     assert found.doubling == pytest.approx(doubling, rel=0.15)
 
@@ -188,7 +188,7 @@ def test_the_fit_finds_the_law_that_made_the_samples(sigma, doubling):
 def test_failed_matches_are_counted_and_are_no_noise():
     errors = np.where(np.arange(1000) % 4 == 0, np.nan, 0.1)
     samples = MatchingSamples(convergence_deg=np.zeros(1000), deformation=np.full(1000, 0.3), error_px=errors)
-    (row,) = binned(samples, (0.2, 0.4))
+    (row,) = bin_samples(samples, (0.2, 0.4))
     assert row["matched_pct"] == 75
     assert row["sigma_px"] == pytest.approx(0.1 / np.sqrt(2))
 
@@ -196,7 +196,9 @@ def test_failed_matches_are_counted_and_are_no_noise():
 def test_upright_windows_suffer_from_deformation_and_slanted_ones_hardly(coarse_phantom: Jaw):
     options = MatchingNoiseOptions(baselines_mm=(2.0,), spacing_px=4)
     samples = sample_matching(coarse_phantom, options, np.random.default_rng(0))
-    noise = {name: [row["sigma_px"] for row in binned(each, (0.05, 0.15, 0.3, 0.5))] for name, each in samples.items()}
+    noise = {
+        name: [row["sigma_px"] for row in bin_samples(each, (0.05, 0.15, 0.3, 0.5))] for name, each in samples.items()
+    }
     assert 0.02 < noise["slanted"][1] < 0.1
     assert 1.5 * noise["slanted"][1] < noise["upright"][1] < 0.4
     assert noise["upright"][0] < noise["upright"][1] < noise["upright"][2]

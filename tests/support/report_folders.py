@@ -230,6 +230,7 @@ def write_calibrated(folder: Path) -> None:
             "sigma_px": 0.065,
             "board_bending_mm": [0.01, 0.0, 0.02],
             "board_distance_mm": 6.0,
+            "frames_per_s": 20.0,
             "cameras": cameras,
             "notes": ["the cameras did not expose together"],
             "photometry": {"cameras": dict.fromkeys(cameras, response), "notes": ["gamma stays"], "lights": {}},

@@ -18,7 +18,7 @@ from cuspid.report.same_origin import address, require_address
 from cuspid.runtime import kernels
 from cuspid.runtime.errors import InputError, OutputError
 from cuspid.runtime.inputs import is_there
-from cuspid.storage.files import finished
+from cuspid.storage.files import list_finished
 from panoramas import stitched_panorama, write_stitched
 from verbs import refused, run
 
@@ -29,7 +29,7 @@ def test_what_systems_put_beside_files_is_passed_over(tmp_path: Path) -> None:
     (tmp_path / "00.png").write_bytes(b"")
     for name in BESIDE:
         (tmp_path / name).mkdir() if "." not in name[1:] else (tmp_path / name).write_bytes(b"no image")
-    assert [path.name for path in finished(tmp_path)] == ["00.png"]
+    assert [path.name for path in list_finished(tmp_path)] == ["00.png"]
     (tmp_path / "._jaw.stl").write_bytes(b"Mac OS X")
     storage.write_mesh(tmp_path / "jaw.stl", box_mesh())
     assert [path.name for path in jaw_files(tmp_path)] == ["jaw.stl"]

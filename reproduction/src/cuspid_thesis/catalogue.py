@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 from cuspid_thesis.results import CHECKED
 from cuspid_thesis.rules import RULES, Equals, Rule
 
@@ -185,7 +185,7 @@ def _item(entry: Any, source: str) -> Item:
     return Item(
         **{key: entry[key] for key in _ITEM if key in entry and _ITEM[key] is str},
         pictures=tuple(_picture(pair, where) for pair in entry.get("pictures", ())),
-        printed=tuple(_printed(row, where) for row in entry.get("printed", ())),
+        printed=tuple(_trueness_row(row, where) for row in entry.get("printed", ())),
         rows=tuple(_row(row, entry.get("each", {}), where) for row in entry.get("row", ())),
         notes=tuple(_note(note, where) for note in entry.get("note", ())),
     )
@@ -193,7 +193,7 @@ def _item(entry: Any, source: str) -> Item:
 
 def _picture(pair: Any, where: str) -> tuple[str, str]:
     if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(each, str) for each in pair)):
-        raise InputError(f"{where}: a picture must be a file and what it shows, not {shown(pair)}")
+        raise InputError(f"{where}: a picture must be a file and what it shows, not {quote(pair)}")
     return pair[0], pair[1]
 
 
@@ -249,7 +249,7 @@ def _note(entry: Any, where: str) -> Note:
     return Note(**entry)
 
 
-def _printed(entry: Any, where: str) -> TruenessRow:
+def _trueness_row(entry: Any, where: str) -> TruenessRow:
     _check(entry, _PRINTED, set(_PRINTED) - {"tooth"}, where)
     return TruenessRow(**entry | {key: float(entry[key]) for key in entry if key.endswith("_um")})
 
@@ -257,13 +257,13 @@ def _printed(entry: Any, where: str) -> TruenessRow:
 def _check(entry: object, known: Keys, required: Collection[str], where: str) -> None:
     """Raise InputError where an entry is no table, has an unknown key or a value of another kind, or lacks a key."""
     if not isinstance(entry, dict):
-        raise InputError(f"{where}: {shown(entry)} is not a table")
+        raise InputError(f"{where}: {quote(entry)} is not a table")
     for key, value in entry.items():
         if key not in known:
             near = get_close_matches(key, known, n=1)
-            raise InputError(f"{where}: unknown key {shown(key)}" + (f"; did you mean {near[0]}?" if near else ""))
+            raise InputError(f"{where}: unknown key {quote(key)}" + (f"; did you mean {near[0]}?" if near else ""))
         if not isinstance(value, known[key]):
-            raise InputError(f"{where}: {key} cannot be {shown(value)}")
+            raise InputError(f"{where}: {key} cannot be {quote(value)}")
     for key in required:
         if key not in entry:
             raise InputError(f"{where}: {key} is missing")

@@ -58,13 +58,13 @@ def reproduce(
     failures: dict[str, str] = {}
     with storage.claimed_folder(out, "reproduce", {}, {}):
         if run:
-            failures = _run(out, missing(items, found, quick), quick, workers)
+            failures = _run_and_report(out, missing(items, found, quick), quick, workers)
             found = gather(out, results)
         draw_pictures(out / "images", found)
         pictures = _pictures(out / "images", images)
         page = make_page(judge(found, items), found, pictures=pictures)
         storage.write_bytes(out / "reproduction.md", markdown(page).encode())
-        storage.write_bytes(out / "reproduction.html", html(page, _embedded(page, out / "images", pictures)).encode())
+        storage.write_bytes(out / "reproduction.html", html(page, _embed(page, out / "images", pictures)).encode())
     _print(page)
     console.print(f"{out / 'reproduction.html'}, {out / 'reproduction.md'}", highlight=False)
     if failures:
@@ -85,7 +85,9 @@ def asked_items(only: Sequence[str]) -> tuple[Item, ...]:
     return tuple(item for item in ITEMS if not only or item.id in only)
 
 
-def _run(out: Path, wanted: Mapping[str, tuple[str, ...]], quick: bool, workers: int | None) -> dict[str, str]:
+def _run_and_report(
+    out: Path, wanted: Mapping[str, tuple[str, ...]], quick: bool, workers: int | None
+) -> dict[str, str]:
     if not wanted:
         return {}
     console.print(f"to run: {', '.join(wanted)}", highlight=False)
@@ -102,7 +104,7 @@ def _pictures(*folders: Path | None) -> dict[str, Path]:
     return {path.name: path for path in reversed(there)}
 
 
-def _embedded(page: Page, folder: Path, pictures: Mapping[str, Path]) -> dict[str, str]:
+def _embed(page: Page, folder: Path, pictures: Mapping[str, Path]) -> dict[str, str]:
     """Addresses that hold the pictures of the page, which are kept in the folder for the Markdown."""
     names = dict.fromkeys(name for entry in page.entries for name, _ in entry.pictures)
     for name in names:

@@ -17,7 +17,7 @@ from cuspid.runtime.errors import InputError
 from cuspid_thesis.catalogue import ITEMS, Item, Note, Row
 from cuspid_thesis.computed import FIGURES, ROWS, TABLES
 from cuspid_thesis.page_format import Table
-from cuspid_thesis.results import Result, Results, at, in_words, looking
+from cuspid_thesis.results import Result, Results, in_words, looking, value_at
 from cuspid_thesis.rules import Comparison, Verdict, least_favourable
 
 
@@ -55,7 +55,7 @@ def judge(results: Results, items: Sequence[Item] = ITEMS) -> tuple[Finding, ...
 
 def _finding(item: Item, results: Results) -> Finding:
     with looking(f"for {item.id}"):
-        comparisons = tuple(_compared(row, item, results) for row in _rows(item, results))
+        comparisons = tuple(_compare(row, item, results) for row in _rows(item, results))
         table = _function(TABLES, item.table, {}, item)(results) if item.table else None
         notes = (*(_note_text(note, results) for note in item.notes), item.table_note if table else "")
     return Finding(item=item, comparisons=comparisons, notes=tuple(filter(None, notes)), table=table)
@@ -75,7 +75,7 @@ def _note_text(note: Note, results: Results) -> str:
     return in_words(note.text, results[note.source]) if note.source in results else note.otherwise
 
 
-def _compared(row: Row, item: Item, results: Results) -> Comparison:
+def _compare(row: Row, item: Item, results: Results) -> Comparison:
     """A figure of ours beside the thesis; not run where there is no such result.
 
     Raises InputError where the result has no such field.
@@ -99,7 +99,7 @@ def _compared(row: Row, item: Item, results: Results) -> Comparison:
 
 
 def _figure(paths: Sequence[str], result: Result) -> Mapping[str, Any] | None:
-    values = tuple(_number(at(result, path)) for path in paths)
+    values = tuple(_number(value_at(result, path)) for path in paths)
     return None if None in values else {"ours": values[0] if len(values) == 1 else values}
 
 

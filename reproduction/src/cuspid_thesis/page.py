@@ -115,11 +115,11 @@ def _row_numbers(numbers: Sequence[int]) -> str:
 def _tally(comparisons: Sequence[Comparison]) -> str:
     counts = Counter(each.verdict for each in comparisons)
     order: tuple[Verdict, ...] = (*reversed(FAVOUR), "not run")
-    named = [f"{counts[each]} {_counted(each, counts[each])}" for each in order if counts[each]]
+    named = [f"{counts[each]} {_verdict_word(each, counts[each])}" for each in order if counts[each]]
     return ", ".join(named) if len(comparisons) > 1 else ""
 
 
-def _counted(verdict: Verdict, count: int) -> str:
+def _verdict_word(verdict: Verdict, count: int) -> str:
     plural = {"differs": "differ", "falls short": "fall short"}
     return WORDS[verdict] if count == 1 else plural.get(verdict, WORDS[verdict])
 

@@ -91,7 +91,7 @@ def markdown(page: Page, *, images: str = "images/") -> str:
     parts = [
         f"# {page.title}",
         "",
-        *(line for text in page.intro for line in (_linked(text), "")),
+        *(line for text in page.intro for line in (_link_pages(text), "")),
         "## At a glance",
         "",
     ]
@@ -106,7 +106,7 @@ def markdown(page: Page, *, images: str = "images/") -> str:
 
 
 def _markdown_entry(entry: Entry, images: str) -> list[str]:
-    lines = [f"## {_heading(entry)}", "", f"Section {entry.section}. {_linked(entry.states)}", ""]
+    lines = [f"## {_heading(entry)}", "", f"Section {entry.section}. {_link_pages(entry.states)}", ""]
     lines += [f"**{entry.verdict}**" + (f" ({entry.tally})" if entry.tally else "") + _tail(entry.lost), ""]
     if entry.rows:
         cells = [
@@ -117,8 +117,8 @@ def _markdown_entry(entry: Entry, images: str) -> list[str]:
     if entry.table is not None:
         lines += [*_markdown_table(*entry.table), ""]
     if entry.rules:
-        lines += ["How it is judged:", "", *(f"- {_linked(rule)}" for rule in entry.rules), ""]
-    lines += [line for note in entry.notes for line in (_linked(note), "")]
+        lines += ["How it is judged:", "", *(f"- {_link_pages(rule)}" for rule in entry.rules), ""]
+    lines += [line for note in entry.notes for line in (_link_pages(note), "")]
     if entry.command:
         lines += ["Not run yet:", "", f"    {entry.command}", ""]
     lines += [line for name, caption in entry.pictures for line in (f"![{caption}]({images}{name})", "", caption, "")]
@@ -128,11 +128,11 @@ def _markdown_entry(entry: Entry, images: str) -> list[str]:
 
 
 def _tail(text: str) -> str:
-    return f": {_linked(text)}" if text else ""
+    return f": {_link_pages(text)}" if text else ""
 
 
 def _heading(entry: Entry) -> str:
-    return _escaped(f"{entry.name}: {entry.title}")
+    return _escape(f"{entry.name}: {entry.title}")
 
 
 def _anchor(entry: Entry) -> str:
@@ -143,15 +143,15 @@ def _anchor(entry: Entry) -> str:
 
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    return [*lines, *("| " + " | ".join(_linked(cell).replace("|", r"\|") for cell in row) + " |" for row in rows)]
+    return [*lines, *("| " + " | ".join(_link_pages(cell).replace("|", r"\|") for cell in row) + " |" for row in rows)]
 
 
-def _linked(text: str) -> str:
+def _link_pages(text: str) -> str:
     """Mentions of other pages of the documentation as links."""
-    return re.sub(r"docs/([\w-]+)\.md", r"[\1](\1.md)", _escaped(text))
+    return re.sub(r"docs/([\w-]+)\.md", r"[\1](\1.md)", _escape(text))
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     """What Markdown would take for something else, outside of code."""
     spans = re.split(r"(`[^`]*`|\]\(#[^)]*\))", text)
     return "".join(each if number % 2 else re.sub(r"([*<$])", r"\\\1", each) for number, each in enumerate(spans))

@@ -9,7 +9,7 @@ from cuspid.report.figures.mouth import save_sagittal_picture
 from cuspid_thesis.catalogue import TABLE_3_2
 from cuspid_thesis.computed.panoramas import canvas_ssim, panoramas
 from cuspid_thesis.drawing import save_ssim_picture, save_trueness_picture
-from cuspid_thesis.results import Result, Results, at, looking
+from cuspid_thesis.results import Result, Results, looking, value_at
 
 TRUENESS, LIKENESS, SAGITTAL = "reproduction-table-3.2.png", "reproduction-fig-4.4.png", "mouth-sagittal.png"
 METHODS = {"ortho": "cuspid, default", "thesis": "the thesis' method"}
@@ -29,7 +29,7 @@ def draw_trueness(path: Path, results: Results) -> None:
         return
     with looking("of Table 3.2"):
         ours = [
-            float(at(results[row.result], row.path)["mean_abs_um"]) if row.result in results else None
+            float(value_at(results[row.result], row.path)["mean_abs_um"]) if row.result in results else None
             for row in TABLE_3_2
         ]
     save_trueness_picture(

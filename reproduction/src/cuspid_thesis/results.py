@@ -8,7 +8,7 @@ from string import Formatter
 from typing import Any
 
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 Result = Mapping[str, Any]
 Results = Mapping[str, Result]
@@ -22,7 +22,7 @@ PANORAMA = "panorama/"
 """How the names of results of panoramas begin; then follow subject and method."""
 
 
-def at(result: Result, path: str) -> Any:
+def value_at(result: Result, path: str) -> Any:
     """What stands at a path. Raises KeyError, TypeError, ValueError or IndexError where nothing does."""
     found: Any = result
     for name in path.split("."):
@@ -41,10 +41,10 @@ def looking(where: str) -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError) as error:
-        raise InputError(f"results {where}: unexpected content ({shown(error)}); run it again") from error
+        raise InputError(f"results {where}: unexpected content ({quote(error)}); run it again") from error
 
 
 class _Paths(Formatter):
     def get_field(self, field_name: str, args: Any, kwargs: Mapping[str, Any]) -> Any:
         found = kwargs["found"]
-        return found[field_name] if field_name in found else at(kwargs["result"], field_name), field_name
+        return found[field_name] if field_name in found else value_at(kwargs["result"], field_name), field_name

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 Verdict = Literal["better", "reproduced", "differs", "falls short", "not run", "not known"]
 """``not run``: we have no figure yet. ``not known``: what the thesis shows is lost in our copy."""
@@ -186,7 +186,7 @@ class Comparison:
 
     def __post_init__(self) -> None:
         if self.ours is not None and not all(isinstance(part, (int, float)) for part in _parts(self.ours)):
-            raise TypeError(f"{shown(self.ours)} is no figure")
+            raise TypeError(f"{quote(self.ours)} is no figure")
 
     @property
     def verdict(self) -> Verdict:

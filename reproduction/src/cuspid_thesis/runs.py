@@ -28,7 +28,7 @@ from cuspid import storage
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.population import GroupName, draw_population
-from cuspid.anatomy.shape.boxed import boxed
+from cuspid.anatomy.shape.boxed import box_crowns
 from cuspid.handpiece.designs import twelve_cameras
 from cuspid.report.figures.drawing import save_picture
 from cuspid.runtime.errors import CuspidError, InputError
@@ -123,7 +123,7 @@ def _mean_shape(task: Task) -> Iterator[tuple[str, Result]]:
     (task.folder / "images").mkdir(parents=True, exist_ok=True)
     save_picture(task.folder / "images" / "shape-mean.png", mean.mesh, title=f"Mean of {count} phantoms")
     title = f"Mean of {count} phantoms, with a box for each tooth"
-    save_picture(task.folder / "images" / "shape-boxed.png", boxed(mean).mesh, title=title)
+    save_picture(task.folder / "images" / "shape-boxed.png", box_crowns(mean).mesh, title=title)
     yield "mean_shape", result
 
 
@@ -224,7 +224,7 @@ _QUICK_TEETH = ("prepared-46", "prepared-45", "prepared-36")
 """A crack, a crown and an inlay."""
 
 
-def _prepared(task: Task) -> Iterator[tuple[str, Result]]:
+def _run_prepared(task: Task) -> Iterator[tuple[str, Result]]:
     for name in task.wanted:
         case = prepared_cases()[name]
         if task.quick:
@@ -278,10 +278,10 @@ def _panoramas(task: Task) -> Iterator[tuple[str, Result]]:
     run_timed("pano", "film", str(jaw), "--out", str(film), *numbers, log=task.log)
     for name in task.wanted:
         method = name.removeprefix(f"{PANORAMA}{subject}-")
-        yield name, _stitched(task, film, subject, method)
+        yield name, _stitch(task, film, subject, method)
 
 
-def _stitched(task: Task, film: Path, subject: str, method: str) -> dict[str, object]:
+def _stitch(task: Task, film: Path, subject: str, method: str) -> dict[str, object]:
     """A panorama of a film, evaluated; in parts, the largest one. What cannot be stitched is a result, too."""
     out, score = task.work / method, task.work / f"{method}-score"
     command = " ".join(("cuspid", "pano", "stitch", "film/capture", *METHODS[method], "--out", method))
@@ -310,10 +310,10 @@ def _panorama_run(subject: str) -> Run:
 
 RUNS: Mapping[str, Run] = MappingProxyType(
     {
-        "prepared-arch": Run(makes=("prepared-arch",), make=_prepared, minutes=35.0, quick="none"),
+        "prepared-arch": Run(makes=("prepared-arch",), make=_run_prepared, minutes=35.0, quick="none"),
         "prepared-teeth": Run(
             makes=tuple(name for name in prepared_cases() if name != "prepared-arch"),
-            make=_prepared,
+            make=_run_prepared,
             minutes=25.0,
             quick_makes=_QUICK_TEETH,
         ),
@@ -360,7 +360,7 @@ def gather(folder: Path, given: Path | None) -> dict[str, Result]:
     return {**read_results(folder / "results-quick", quick=True), **others, **read_results(folder / "results")}
 
 
-def needed(items: Sequence[Item]) -> tuple[str, ...]:
+def needed_results(items: Sequence[Item]) -> tuple[str, ...]:
     """Names of the results that items are judged by."""
     patterns = dict.fromkeys(each.source for finding in judge({}, items) for each in finding.comparisons)
     return tuple(name for name in ALL_RESULTS if any(fnmatch(name, pattern) for pattern in patterns))
@@ -372,7 +372,7 @@ def missing(items: Sequence[Item], results: Results, quick: bool) -> dict[str, t
     for method in METHODS:
         if len(panoramas(results, method)) >= SUBJECTS:  # of whatever subjects
             there |= {name for name in ALL_RESULTS if fnmatch(name, f"{PANORAMA}*-{method}")}
-    left = set(needed(items)) - there
+    left = set(needed_results(items)) - there
     found = {}
     for name, run in RUNS.items():
         asked = run.makes if not quick else () if run.quick == "none" else run.quick_makes or run.makes

@@ -40,7 +40,7 @@ _PR_SET_PDEATHSIG = 1
 _STAGES = ("depth", "depth-across", "motion")
 
 
-def timed(*command: str, log: IO[bytes] | None = None) -> tuple[int, dict[str, float]]:
+def run_program(*command: str, log: IO[bytes] | None = None) -> tuple[int, dict[str, float]]:
     """Run a program; its exit status, wall seconds, CPU seconds and peak memory in GiB. It writes to ``log``, or where
     this process does."""
     begin = time.perf_counter()
@@ -67,11 +67,11 @@ def run_timed(*arguments: str, log: Path | None = None) -> dict[str, float]:
     """
     command = (sys.executable, "-m", "cuspid", *arguments)
     if log is None:
-        status, figures = timed(*command)
+        status, figures = run_program(*command)
     else:
         log.parent.mkdir(parents=True, exist_ok=True)
         with open_to_append(log) as stream:
-            status, figures = timed(*command, log=stream)
+            status, figures = run_program(*command, log=stream)
     if status:
         raise CuspidError(f"cuspid {arguments[0]} failed with status {status}{'' if log is None else _last_words(log)}")
     return figures

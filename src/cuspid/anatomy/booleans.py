@@ -111,7 +111,7 @@ def run_lengths(mesh: manifold3d.Mesh64) -> Int[np.ndarray, "r"]:
     return np.asarray(np.diff(np.asarray(mesh.run_index, dtype=np.int64)) // 3)
 
 
-def closed(mesh: Mesh) -> Mesh:
+def close_holes(mesh: Mesh) -> Mesh:
     """The mesh with its holes closed; the faces that close them come last.
 
     The longest border, the rim of an open scan, is drawn together far below; every other one to its middle.

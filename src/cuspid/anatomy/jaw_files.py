@@ -20,7 +20,7 @@ from cuspid.model.jaw import ARCHES, Arch, Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import is_there
-from cuspid.storage.files import finished, reading
+from cuspid.storage.files import list_finished, reading
 from cuspid.storage.jaws import is_jaw, read_label_map, read_labelled_mesh
 from cuspid.storage.jaws import read_jaw as read_own_jaw
 from cuspid.storage.landmarks import MARKUPS_SUFFIX, read_landmarks
@@ -133,7 +133,7 @@ def jaw_files(folder: Path) -> list[Path]:
         return [folder]
     if not folder.is_dir():
         raise InputError(f"{folder}: no such file or folder")
-    found = sorted(path for path in finished(folder) if path.suffix.lower() in MESH_SUFFIXES)
+    found = sorted(path for path in list_finished(folder) if path.suffix.lower() in MESH_SUFFIXES)
     if not found:
         raise InputError(f"{folder}: there are no jaw meshes in it; give a folder with STL, PLY, OBJ or OFF files")
     return found

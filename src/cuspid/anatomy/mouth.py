@@ -102,7 +102,7 @@ class Mouth:
         slope = np.deg2rad(self.slope_deg)
         return self.path_mm * np.cos(slope), self.path_mm * np.sin(slope)
 
-    def moved(self, behind_mm: Sizes, share: Sizes = 1.0) -> tuple[Sizes, Sizes]:
+    def displacement_mm(self, behind_mm: Sizes, share: Sizes = 1.0) -> tuple[Sizes, Sizes]:
         """How far a point of the lower occlusal plane moves: forwards (dx) and downwards (V), mm.
 
         ``behind_mm``: its distance behind the incisal edges (f). ``share``: part of the turn and slide that is done.
@@ -115,7 +115,7 @@ class Mouth:
 
     def places_mm(self, behind_mm: Float[np.ndarray, "k"], share: float = 1.0) -> Float[np.ndarray, "k 2"]:
         """Where points of one person's lower occlusal plane are: x forwards and z upwards of the hinge axis."""
-        forwards, down = self.moved(behind_mm, share)
+        forwards, down = self.displacement_mm(behind_mm, share)
         return np.column_stack([self.incisor_mm - behind_mm + forwards, -self.depth_mm - down])
 
     def condyle_mm(self, share: float = 1.0) -> Float[np.ndarray, "2"]:
@@ -125,11 +125,11 @@ class Mouth:
 
     def gap_mm(self, behind_mm: Sizes) -> Sizes:
         """L: straight distance between upper and lower occlusal plane at a place behind the incisal edges."""
-        return np.hypot(*self.moved(behind_mm))
+        return np.hypot(*self.displacement_mm(behind_mm))
 
     def vertical_gap_mm(self, behind_mm: Sizes) -> Sizes:
         """V: how far the point of the lower occlusal plane lies below the upper one."""
-        return self.moved(behind_mm)[1]
+        return self.displacement_mm(behind_mm)[1]
 
 
 def opening_turn_rad(opening_mm: Sizes, radius_mm: Sizes, depth_mm: Sizes, path_mm: Sizes, slope_deg: Sizes) -> Sizes:

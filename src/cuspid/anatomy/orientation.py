@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from cuspid.geometry import Rigid3, axes_about, best_similarity, unit
 from cuspid.model.facing import pieces_of
 from cuspid.model.mesh import Mesh
-from cuspid.model.occlusal_plane import SPEE_MM, crown_tips, crown_tops, levelled, upright
+from cuspid.model.occlusal_plane import SPEE_MM, crown_tips, crown_tops, level_crowns, upright
 from cuspid.runtime.errors import InputError
 from cuspid.storage import MM_PER_UNIT, Unit
 
@@ -217,7 +217,7 @@ def _level_frame(
     mesh: Mesh, start: Rigid3, tilt_sd_deg: float = _TILT_SD_DEG, off_plane_mm: float = SPEE_MM
 ) -> tuple[_Relief, Rigid3]:
     """A frame turned so that the tips of the crowns lie in the plane XY on average, and what is seen from there."""
-    frame = levelled(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, tilt_sd_deg, off_plane_mm) @ start
+    frame = level_crowns(lambda turn: _relief(mesh, turn @ start).points, _GRID_MM, tilt_sd_deg, off_plane_mm) @ start
     return _relief(mesh, frame, off_plane_mm), frame
 
 

@@ -51,11 +51,11 @@ class BoardShape:
         """Whether its corners lie as given, as far as matters."""
         return max(self.sigma_mm) <= _FLAT * board.square_mm
 
-    def at(self, nodes: Int[np.ndarray, "n m"], shares: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n 3"]:
+    def interpolate(self, nodes: Int[np.ndarray, "n m"], shares: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n 3"]:
         """Offsets of corners, mm, by their nodes (:func:`nodes_of`)."""
         return np.asarray(np.einsum("nm,nmj->nj", shares, self.offsets_mm[nodes]))
 
-    def moved(self, step_mm: Float[np.ndarray, "k"]) -> BoardShape:
+    def with_step(self, step_mm: Float[np.ndarray, "k"]) -> BoardShape:
         """With nodes that lie elsewhere by so much."""
         return replace(self, offsets_mm=self.offsets_mm + step_mm.reshape(-1, 3))
 

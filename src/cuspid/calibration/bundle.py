@@ -185,7 +185,7 @@ class Adjusted:
         return self._uncertainty[0]
 
     @property
-    def moved(self) -> Float[np.ndarray, "i k"]:
+    def influence(self) -> Float[np.ndarray, "i k"]:
         """By how much each instant moves these (:mod:`cuspid.calibration.scatter`)."""
         return self._uncertainty[1]
 
@@ -293,7 +293,7 @@ def _bases(board: Target, points: Float[np.ndarray, "n 3"], number: Int[np.ndarr
     return np.concatenate(own, axis=1)
 
 
-def bent(
+def bend_points(
     board: Board, points: Float[np.ndarray, "n 3"], bending_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Points of the board as it is given, moved to where they are on the bent one, mm."""
@@ -349,7 +349,7 @@ def _project(scene: BoardScene, seen: _Observations) -> _Projection:
 
 def _bend_points(scene: BoardScene, seen: _Observations) -> Float[np.ndarray, "n 3"]:
     """On the body."""
-    flat = seen.points if scene.shape is None else seen.points + scene.shape.at(seen.nodes, seen.shares)
+    flat = seen.points if scene.shape is None else seen.points + scene.shape.interpolate(seen.nodes, seen.shares)
     points = np.asarray(flat + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0])
     return _move_points(_all_mounts(scene, seen), seen.board, points) if scene.body_from_board else points
 
@@ -594,7 +594,7 @@ def at_middle_rows(scene: BoardScene, views: Views, board: Target) -> dict[tuple
     at_once = replace(scene, timing=replace(scene.timing, readout={}))
     seen = _Observations.of(views, board, scene)
     late = np.split(_project(scene, seen).raw - _project(at_once, seen).raw, seen.starts[1:-1])
-    return {key: view.moved(each) for (key, view), each in zip(views.items(), late, strict=True)}
+    return {key: view.shifted(each) for (key, view), each in zip(views.items(), late, strict=True)}
 
 
 def _minimize(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
@@ -890,7 +890,7 @@ def _apply_step(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) ->
         rig_from_board=_all_moved(scene.rig_from_board, boards),
         bending_mm=scene.bending_mm + bending,
         body_from_board=_all_moved(scene.body_from_board, mounts),
-        shape=scene.shape and scene.shape.moved(shape),
+        shape=scene.shape and scene.shape.with_step(shape),
         timing=scene.timing and scene.timing.later(cameras, readouts, views),
         loose_px=scene.loose_px,
     )
@@ -1005,7 +1005,7 @@ def readout_sigmas(found: Adjusted) -> dict[str, float]:
     if timing is None or not timing.readout:
         return {}
     part = slice(-len(timing.readout), None)
-    covariance = covariance_of(found.covariance[part, part], found.moved[:, part])
+    covariance = covariance_of(found.covariance[part, part], found.influence[:, part])
     return dict(zip(timing.readout, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
 
@@ -1013,15 +1013,15 @@ def mounted_cameras(found: Adjusted) -> dict[str, MountedCamera]:
     """The cameras with their covariances, by how much the instants disagree."""
     count, numbers, mounted = len(found.scene.cameras), _numbers(found.scene), {}
 
-    def known(part: slice) -> Float[np.ndarray, "n n"]:
-        return _symmetric(covariance_of(found.covariance[part, part], found.moved[:, part]))
+    def covariance_block(part: slice) -> Float[np.ndarray, "n n"]:
+        return _symmetric(covariance_of(found.covariance[part, part], found.influence[:, part]))
 
     for index, (name, camera) in enumerate(found.scene.cameras.items()):
         lens = slice(numbers * index, numbers * index + len(camera.parameters))
         first = numbers * count + _PLACE * index
         place = slice(first, first + _PLACE)
         mounted[name] = MountedCamera(
-            replace(camera, covariance=known(lens)), found.scene.cam_from_rig[name], known(place)
+            replace(camera, covariance=covariance_block(lens)), found.scene.cam_from_rig[name], covariance_block(place)
         )
     return mounted
 

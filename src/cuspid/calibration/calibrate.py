@@ -31,8 +31,8 @@ from cuspid.calibration.circle_centres import centre_shifts
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, split_by_board
 from cuspid.calibration.joining import joined_boards
 from cuspid.calibration.lenses import LensChoice, LensName, choose_lens, splined_where_earned
-from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, joined, renumbered, require_one_group
-from cuspid.calibration.timing import adjust_scene, follow_each_other, rolling, untied
+from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, join_cameras, renumber_instant, require_one_group
+from cuspid.calibration.timing import adjust_scene, allow_delays, follow_each_other, rolling
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.camera import Camera
@@ -79,6 +79,8 @@ class CalibrationOptions(Options):
     """auto: where a filmed board moves, it is estimated how long after the first row of an image the last one is
     exposed, and kept if that explains images that it was not estimated from. global: all rows are exposed at once."""
 
+    frames_per_s: Annotated[float | None, Range(0.001, 100_000)] = None
+    """Rate at which the board was filmed, to tell delays and readouts in ms too; default: that which videos state."""
     outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
     """A view is left out if the RMS of its residuals is beyond this, in standard deviations of all residuals or of its
     camera's."""
@@ -155,6 +157,8 @@ class RigCalibration:
     """Pose of the board when each view of it was taken, by camera and instant."""
     distance_mm: float
     """Median distance of the board from the cameras."""
+    frames_per_s: float | None = None
+    """Rate at which the board was filmed; None where nothing states it."""
     notes: tuple[str, ...]
     """What was left out and why, one line each."""
 
@@ -185,7 +189,7 @@ def _correct_circle_centres(views: Views, found: RigCalibration, board: Board) -
             cam_from_board = board_pose(view, board, camera)
         except InputError:  # it is left out in any case
             continue
-        centred[name, instant] = view.moved(-centre_shifts(camera, cam_from_board, board, view.corner))
+        centred[name, instant] = view.shifted(-centre_shifts(camera, cam_from_board, board, view.corner))
     return centred
 
 
@@ -209,11 +213,11 @@ def _calibrate_once(
     if isinstance(board, BoardSet):
         start, common, how = joined_boards(views, board, cameras)
     else:
-        start, common = joined(views, board, cameras, sorted({instant for _, instant in views}))
+        start, common = join_cameras(views, board, cameras, sorted({instant for _, instant in views}))
 
     def attempt(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
         found, chosen, notes = _fit_cameras(scene, common, board, options)
-        return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes)))
+        return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes), options.frames_per_s))
 
     best = _with_timing(attempt(start), start, common, board, options, attempt)
     splined = _find_splines(best, choices, board) if options.lens == "auto" else {}
@@ -260,7 +264,7 @@ def _with_timing(
     doubtful = any(_is_doubtful_together(check) for check in best.described.cameras.values())
     if len(start.cameras) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
         with suppress(ReconstructionError):  # the images do not tell delays as well
-            apart = attempt(untied(start, frame, common))
+            apart = attempt(allow_delays(start, frame, common))
             best = apart if _is_better(apart.described, best.described) else best
     if not may_roll(best.found.scene, best.described.views):
         return best
@@ -362,7 +366,7 @@ def _uneven(found: Adjusted, views: Views, board: Board) -> tuple[Adjusted, View
         replace(found.scene, shape=BoardShape.even(board)), {key: views[key] for key in found.residuals}, board
     )
     for _ in range(_TURNS if len(board.orders) > 1 else 0):
-        turned = renumbered(found, {key: views[key] for key in found.residuals}, board)
+        turned = renumber_instant(found, {key: views[key] for key in found.residuals}, board)
         if turned is None:
             break
         scene, used = turned
@@ -503,6 +507,7 @@ def _describe(
     board: Target,
     lenses: Mapping[str, LensChoice],
     notes: tuple[str, ...],
+    frames_per_s: float | None,
 ) -> RigCalibration:
     names, views = list(found.scene.cameras), {key: chosen[key] for key in found.residuals}
     of = {name: [key for key in views if key[0] == name] for name in names}
@@ -546,7 +551,8 @@ def _describe(
         views=views,
         rig_from_view=seen,
         distance_mm=float(np.median(distances)),
-        notes=(*notes, *_of_board(found.scene), *_doubts(found.settled, checks, rig)),
+        frames_per_s=frames_per_s,
+        notes=(*notes, *_of_board(found.scene), *_of_time(checks, frames_per_s), *_doubts(found.settled, checks, rig)),
     )
 
 
@@ -596,17 +602,19 @@ def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjus
 def _lens_apart(camera: Camera, alone: Adjusted) -> float:
     """Difference of the parameters from those of the camera alone, in the standard deviations of these."""
     (other,) = (each.camera for each in mounted_cameras(alone).values())
-    return _in_sigmas(camera.parameters - other.parameters, known(other.covariance))
+    return _in_sigmas(camera.parameters - other.parameters, require_covariance(other.covariance))
 
 
 def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
     """With covariances that account for how far two halves of the images are apart, and the lens from that of its own
     views alone, where chance hardly explains it; and with its shutter."""
-    camera = replace(mounted.camera, covariance=_lens_factor(check) ** 2 * known(mounted.camera.covariance))
+    camera = replace(
+        mounted.camera, covariance=_lens_factor(check) ** 2 * require_covariance(mounted.camera.covariance)
+    )
     return replace(
         mounted,
         camera=camera,
-        covariance=_beyond_chance(check.place_apart) ** 2 * known(mounted.covariance),
+        covariance=_beyond_chance(check.place_apart) ** 2 * require_covariance(mounted.covariance),
         shutter=Shutter(
             delay_frames=check.delay_frames or 0.0,
             delay_sigma_frames=check.delay_spread_frames or 0.0,
@@ -635,13 +643,15 @@ def _of_board(scene: BoardScene) -> Iterator[str]:
         )
 
 
-def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
-    """Where the search did not end; where the lens or the board is not what the model says, or the cameras were not
-    triggered together; where the views leave the focal length open."""
-    if not settled:
-        yield "the adjustment did not converge; its results may be wrong"
+def _of_time(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> Iterator[str]:
+    """Where the cameras do not expose together, or not all of their rows."""
+
+    def told(name: str, frames: float, sigma: float | None, digits: int) -> str:
+        in_ms = "" if frames_per_s is None else f" ({1000 * frames / frames_per_s:+.1f} ms)"
+        return f"{name} {frames:+.{digits}f} ± {sigma:.{digits}f}{in_ms}"
+
     delays = [
-        f"{name} {check.delay_frames:+.2f} ± {check.delay_spread_frames:.2f}"
+        told(name, check.delay_frames, check.delay_spread_frames, 2)
         for name, check in checks.items()
         if check.delay_frames is not None
     ]
@@ -651,15 +661,20 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
             f"{', '.join(delays)}; this is taken into account, but a board that is held still gives more"
         )
     readouts = [
-        f"{name} {check.readout:+.3f} ± {check.readout_sigma:.3f}"
-        for name, check in checks.items()
-        if check.readout is not None
+        told(name, check.readout, check.readout_sigma, 3) for name, check in checks.items() if check.readout is not None
     ]
     if readouts:
         yield (
             "the cameras do not expose all rows at once; by the motion of the board, from the first row to the last, "
             f"as a share of the time between frames: {', '.join(readouts)}; this is taken into account"
         )
+
+
+def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
+    """Where the search did not end; where the lens or the board is not what the model says, or the cameras were not
+    triggered together; where the views leave the focal length open."""
+    if not settled:
+        yield "the adjustment did not converge; its results may be wrong"
     for name, check in checks.items():
         worst = max(check.parameters_apart or 0.0, check.place_apart or 0.0)
         if worst > _DOUBTFUL:
@@ -680,7 +695,7 @@ def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Itera
                 "they may not have seen the board at the same moment, or have moved against each other"
             )
     for name, mounted in rig.cameras.items():
-        share = float(np.sqrt(known(mounted.camera.covariance)[0, 0])) / mounted.camera.focal_px[0]
+        share = float(np.sqrt(require_covariance(mounted.camera.covariance)[0, 0])) / mounted.camera.focal_px[0]
         if share > _OPEN_SHARE:
             yield f"camera {name}: its focal length is known only to {share:.0%}; show the board tilted, near and far"
 
@@ -737,13 +752,13 @@ def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
         a, b = ours[name], theirs[name]
         shift = a.camera.parameters - b.camera.parameters
         found[name] = (
-            _in_sigmas(shift, known(a.camera.covariance) + known(b.camera.covariance)),
-            _in_sigmas(motion, known(a.covariance) + known(b.covariance)),
+            _in_sigmas(shift, require_covariance(a.camera.covariance) + require_covariance(b.camera.covariance)),
+            _in_sigmas(motion, require_covariance(a.covariance) + require_covariance(b.covariance)),
         )
     return found
 
 
-def known(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"]:
+def require_covariance(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.ndarray, "n n"]:
     """The covariance of a camera that was calibrated here, which always has one."""
     if covariance is None:
         raise ValueError("a calibration without covariance")

@@ -36,7 +36,7 @@ class BoardView:
         """The same view under another numbering of the corners (``Board.orders``)."""
         return BoardView(order[self.corner], self.pixels)
 
-    def moved(self, shift_px: Float[np.ndarray, "n 2"]) -> BoardView:
+    def shifted(self, shift_px: Float[np.ndarray, "n 2"]) -> BoardView:
         """The same view with its corners elsewhere."""
         return BoardView(self.corner, self.pixels + shift_px)
 
@@ -114,7 +114,7 @@ def _chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | No
     if lattice is None or not is_as_large(lattice, board):
         # Of a larger chessboard it would find a part.
         return None if lattice is not None and is_larger(lattice, board) else _exhaustively(image, size)
-    return _view(lattice.numbered(board))
+    return _view(lattice.number_corners(board))
 
 
 def _exhaustively(image: UInt8[np.ndarray, "h w"], size: tuple[int, int]) -> BoardView | None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -21,12 +20,15 @@ from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.rig import Handpiece, depth_of_field_mm
 from cuspid.runtime.errors import ReconstructionError
+from cuspid.runtime.image_files import Pixels, visible_grey
 from cuspid.runtime.progress import Progress, silent
-from cuspid.runtime.values import named
+from cuspid.runtime.values import join_names
 from cuspid.runtime.workers import map_in_threads
 
 _OTHER_CIRCLES = 0.06
 """Error of the diameter of circles, as a share, that is told."""
+_OTHER_RATE = 0.01
+"""Share by which films have different rates."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,9 +61,11 @@ def calibrate(
     distance of the board. Raises ReconstructionError, which names the cause, where a camera hardly saw the board as it
     was described, and InputError where nothing tells which images were taken together.
     """
-    images, named_notes = _matched(images)
+    images, named_notes = _match_frames(images)
     views = _views(images, board, progress)
     _require_views(images, views, board)
+    if options.frames_per_s is None:
+        options = replace(options, frames_per_s=_common_rate(images))
     found = calibrate_rig(views, {name: each.size for name, each in images.items()}, board, options)
     drawn_notes = () if drawn is None else size_notes(found.rig, drawn.rig, board)
     drawn_notes += tuple(_other_circles(images, views, board))
@@ -85,14 +89,14 @@ def _light(
     """What the cameras make of light, from the images that were used."""
     index = {name: {frame: k for k, frame in enumerate(each.names)} for name, each in sequences.items()}
 
-    def image(camera: str, instant: str) -> UInt8[np.ndarray, "h w 3"]:
-        return sequences[camera].image(index[camera][instant])
+    def image(camera: str, instant: str) -> Pixels:
+        return sequences[camera].fine_image(index[camera][instant])
 
     patches = look_at_patches(found, image, board, options, progress=progress)
     return calibrate_light(found, patches, board, drawn, options)
 
 
-def _matched(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSequence], tuple[str, ...]]:
+def _match_frames(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSequence], tuple[str, ...]]:
     """With frames that have one name where they were taken at one instant, and how they were matched if not by theirs.
     Raises InputError where nothing tells."""
     instants = common_instants({camera: each.names for camera, each in sequences.items()})
@@ -106,13 +110,20 @@ def _matched(sequences: Mapping[str, ImageSequence]) -> tuple[dict[str, ImageSeq
     return {camera: replace(each, instants=instants[camera]) for camera, each in sequences.items()}, (note,)
 
 
+def _common_rate(sequences: Mapping[str, ImageSequence]) -> float | None:
+    """Frames a second of all films; None where one does not state it, or they differ."""
+    rates = [each.frames_per_s for each in sequences.values()]
+    known = [each for each in rates if each is not None]
+    return known[0] if len(known) == len(rates) and max(known) < (1 + _OTHER_RATE) * min(known) else None
+
+
 def _views(sequences: Mapping[str, ImageSequence], board: Target, progress: Progress) -> Views:
     """The board in every image that shows it."""
     images = [(camera, index) for camera, sequence in sequences.items() for index in range(len(sequence))]
 
     def find(image: tuple[str, int]) -> BoardView | None:
         camera, index = image
-        return find_corners(cv2.cvtColor(sequences[camera].image(index), cv2.COLOR_RGB2GRAY), board)
+        return find_corners(visible_grey(sequences[camera].fine_image(index)), board)
 
     found = map_in_threads(find, images, stage="corners", progress=progress)
     return {
@@ -158,7 +169,7 @@ def _other_circles(sequences: Mapping[str, ImageSequence], views: Views, board: 
 def _some(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:
     """A few of some images, evenly, in grey."""
     tried = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, MOST_TRIED).astype(int))] if indices else []
-    return [cv2.cvtColor(sequence.image(index), cv2.COLOR_RGB2GRAY) for index in tried]
+    return [visible_grey(sequence.fine_image(index)) for index in tried]
 
 
 def _unseen(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[str]:
@@ -166,7 +177,8 @@ def _unseen(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[st
     for name, sequence in sequences.items():
         unseen = [instant for instant in sequence.names if (name, instant) not in views]
         if unseen:
-            yield f"camera {name}: the board was not found in {len(unseen)} of {len(sequence)} images: {named(unseen)}"
+            missed = f"{len(unseen)} of {len(sequence)} images: {join_names(unseen)}"
+            yield f"camera {name}: the board was not found in {missed}"
 
 
 def _handpiece(
@@ -177,10 +189,12 @@ def _handpiece(
     if drawn is not None:
         lights = drawn.lights if light is None else light.lights
         known = replace(drawn, rig=found.rig, lights=lights, sensors={**drawn.sensors, **sensors}, name="calibrated")
-        return known if working_distance_mm is None else _focused(known, working_distance_mm)
+        return known if working_distance_mm is None else _focus_at(known, working_distance_mm)
     distance_mm = found.distance_mm if working_distance_mm is None else working_distance_mm
-    return _focused(Handpiece(rig=found.rig.over_surface(distance_mm), sensors=sensors, name="calibrated"), distance_mm)
+    return _focus_at(
+        Handpiece(rig=found.rig.over_surface(distance_mm), sensors=sensors, name="calibrated"), distance_mm
+    )
 
 
-def _focused(handpiece: Handpiece, distance_mm: float) -> Handpiece:
+def _focus_at(handpiece: Handpiece, distance_mm: float) -> Handpiece:
     return replace(handpiece, working_distance_mm=distance_mm, depth_range_mm=depth_of_field_mm(distance_mm))

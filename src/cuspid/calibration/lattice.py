@@ -77,7 +77,7 @@ class Lattice:
         greater, lesser = sorted((self.cells.max(axis=0) + 1).tolist(), reverse=True)
         return greater, lesser
 
-    def numbered(self, board: Board) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"]] | None:
+    def number_corners(self, board: Board) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"]] | None:
         """Numbers of the corners on a board that is as large, and where they lie to a fraction of a pixel (OpenCV's
         coordinates); None where the colours of its squares are others."""
         columns, rows, place = board.columns - 1, board.rows - 1, self.cells

@@ -8,13 +8,14 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from cuspid.calibration.bundle import bent
+from cuspid.calibration.bundle import bend_points
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
 from cuspid.model.camera import Camera
+from cuspid.runtime.image_files import Pixels
 from cuspid.runtime.options import Options, Range
 
 BRIGHTEST_DN, DARKEST_DN = 245.0, 8.0
@@ -132,7 +133,7 @@ def _to_step(board: Board, columns: int) -> Float[np.ndarray, "w"]:
 
 
 def patches_of(
-    image: UInt8[np.ndarray, "h w 3"],
+    image: Pixels,
     camera: Camera,
     cam_from_board: Rigid3,
     board: Board,
@@ -162,7 +163,7 @@ def on_board(
     board: Board, places: Float[np.ndarray, "n 2"], bending_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Places seen from straight above, in the frame of the board, mm."""
-    return bent(board, np.column_stack([places, -board.step_mm * board.terrace_at(places[:, 0])]), bending_mm)
+    return bend_points(board, np.column_stack([places, -board.step_mm * board.terrace_at(places[:, 0])]), bending_mm)
 
 
 def _in_squares(board: Board, corner: Int[np.ndarray, "k"], places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
@@ -190,9 +191,7 @@ def _spread_samples(chosen: Int[np.ndarray, "n"], dark: Bool[np.ndarray, "m"], m
     )
 
 
-def _grey(
-    image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def _grey(image: Pixels, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Mean and variance of the windows at places in an image."""
     column, row = np.floor(pixels).astype(np.int64).T
     windows = image[row[:, None] + _WINDOW[:, 0], column[:, None] + _WINDOW[:, 1]].astype(np.float64)

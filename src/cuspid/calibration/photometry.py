@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from cuspid.calibration.bundle import bending_coordinates
-from cuspid.calibration.calibrate import RigCalibration, known
+from cuspid.calibration.calibrate import RigCalibration, require_covariance
 from cuspid.calibration.noise import Noise, noise_of
 from cuspid.calibration.patches import (
     BRIGHTEST_DN,
@@ -41,11 +41,11 @@ from cuspid.calibration.shading import (
 )
 from cuspid.model.board import Board
 from cuspid.model.rig import Handpiece, Light, Sensor, falloff_terms
+from cuspid.runtime.image_files import Pixels
 from cuspid.runtime.options import Range
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import map_in_threads
 
-Image = UInt8[np.ndarray, "h w 3"]
 ViewPatches = Mapping[tuple[str, str], Patches]
 """Patches by camera and instant."""
 
@@ -146,7 +146,7 @@ class Photometry:
 
 def look_at_patches(
     found: RigCalibration,
-    image: Callable[[str, str], Image],
+    image: Callable[[str, str], Pixels],
     board: Board,
     options: PhotometryOptions,
     *,
@@ -183,7 +183,7 @@ def calibrate_light(
     noise = {name: noise_of(_of_camera(sound, name)) for name in names}
     seen = {key: each for key, each in sound.items() if key[0] in names and len(each.level_dn)}
     case = _Case(found, seen, board, names, noise, drawn, options)
-    fit = case.adjusted()
+    fit = case.adjust()
     if case.lamps and fit.extra_sigma.max() > _FOREIGN:
         notes.append(
             "the board was not lit by the drawn lights alone: its light differs from theirs by "
@@ -191,7 +191,7 @@ def calibrate_light(
             "and the light on the board is taken as unknown"
         )
         case = replace(case, lamps_known=False)
-        fit = case.adjusted()
+        fit = case.adjust()
     return _describe(case, fit, {name: _share(~each.usable) for name, each in looked_at.items()}, notes)
 
 
@@ -254,9 +254,9 @@ class _Case:
     def instants(self) -> list[str]:
         """Those with the same light follow each other, so that every second one has seen all of them."""
         names = sorted({instant for _, instant in self.patches})
-        return sorted(names, key=lambda name: self.lit(name))
+        return sorted(names, key=lambda name: self.lamps_on(name))
 
-    def lit(self, instant: str) -> tuple[int, ...]:
+    def lamps_on(self, instant: str) -> tuple[int, ...]:
         """The lamps that are on: all, unless the name ends in a hyphen and the name of a pattern or of a lamp."""
         if self.drawn is None:
             return ()
@@ -268,7 +268,7 @@ class _Case:
         return tuple(range(len(lamps)))
 
     @property
-    def given(self) -> Given:
+    def prior(self) -> Given:
         """What is known before."""
         lamps, options = self.lamps, self.options
         tolerance = np.diag([(options.led_um / 1000) ** 2] * 3 + [(options.led_power_pct / 100) ** 2])
@@ -307,7 +307,7 @@ class _Case:
                 [pose.apply(self.patches[key].points) for key, pose in zip(keys, poses, strict=True)]
             ),
             normals=np.repeat([-pose.rotation[:, 2] for pose in poses], counts, axis=0),
-            lit=tuple(self.lit(instant) for instant in instants),
+            lit=tuple(self.lamps_on(instant) for instant in instants),
         )
 
     def _sigma(self, patches: Patches, camera: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -318,15 +318,15 @@ class _Case:
             sigma_dn[own] = self.noise[name].sigma_dn(patches.level_dn[own])
         return np.asarray(sigma_dn / np.sqrt(VALUES) / patches.level_dn)
 
-    def adjusted(self) -> Shading:
+    def adjust(self) -> Shading:
         """From all instants."""
-        return adjust_shading(self.samples(self.instants), self.given)
+        return adjust_shading(self.samples(self.instants), self.prior)
 
-    def unadjusted(self, extra_sigma: Float[np.ndarray, "d"]) -> Shading:
+    def adjust_brightness(self, extra_sigma: Float[np.ndarray, "d"]) -> Shading:
         """With cameras and lamps as given; only how bright all is is found."""
-        held = np.zeros(len(self.given.precision))
+        held = np.zeros(len(self.prior.precision))
         held[common_columns(len(self.names))] = np.nan
-        return adjust_shading(self.samples(self.instants), self.given, held=held, extra_sigma=extra_sigma)
+        return adjust_shading(self.samples(self.instants), self.prior, held=held, extra_sigma=extra_sigma)
 
     def halves(self) -> list[tuple[Samples, Shading]]:
         """Each for itself; nothing where they are too small, or miss a camera."""
@@ -336,7 +336,7 @@ class _Case:
         samples = [self.samples(part) for part in parts]
         if any(len(np.unique(each.camera)) < len(self.names) for each in samples):
             return []
-        return [(each, adjust_shading(each, self.given)) for each in samples]
+        return [(each, adjust_shading(each, self.prior)) for each in samples]
 
 
 # --- what it is worth --------------------------------------------------------------------------------------------
@@ -376,7 +376,7 @@ def _residuals(
     case: _Case, fit: Shading
 ) -> dict[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]:
     """Of each camera: r of its patches, and residuals before and after, %."""
-    samples, before = case.samples(case.instants), case.unadjusted(fit.extra_sigma)
+    samples, before = case.samples(case.instants), case.adjust_brightness(fit.extra_sigma)
     own = {name: samples.camera == index for index, name in enumerate(case.names)}
     return {
         name: (np.sqrt(samples.terms[at, 0]), 100 * before.residuals[at], 100 * fit.residuals[at])
@@ -386,7 +386,7 @@ def _residuals(
 
 def _corner_sigma(sensor: Sensor) -> float:
     """Standard deviation of the light in the corners, as a share of that in the middle."""
-    return (1 - sensor.corner_loss) * float(np.sqrt(known(sensor.covariance)[1:3, 1:3].sum()))
+    return (1 - sensor.corner_loss) * float(np.sqrt(require_covariance(sensor.covariance)[1:3, 1:3].sum()))
 
 
 def _as_told(sensor: Sensor, given: Sensor) -> Sensor:
@@ -395,7 +395,7 @@ def _as_told(sensor: Sensor, given: Sensor) -> Sensor:
 
 
 def _numbers(sensor: Sensor, noise: Noise) -> dict[str, float | None]:
-    covariance, told = known(sensor.covariance), _corner_sigma(sensor) <= _NO_CORNER
+    covariance, told = require_covariance(sensor.covariance), _corner_sigma(sensor) <= _NO_CORNER
     return {
         "gain": sensor.gain,
         "gain_sigma_pct": 100 * float(np.sqrt(covariance[0, 0])),
@@ -438,7 +438,7 @@ def _held_out(case: _Case, halves: Sequence[tuple[Samples, Shading]]) -> dict[st
     """Residuals of each half under what the other one tells."""
     left: dict[str, list[Float[np.ndarray, "n"]]] = {name: [] for name in case.names}
     for (samples, _), (_, other) in zip(halves, halves[::-1], strict=True):
-        residuals = adjust_shading(samples, case.given, held=other.unknowns, extra_sigma=other.extra_sigma).residuals
+        residuals = adjust_shading(samples, case.prior, held=other.unknowns, extra_sigma=other.extra_sigma).residuals
         for index, name in enumerate(case.names):
             left[name].append(residuals[samples.camera == index])
     return {name: np.concatenate(each) if each else np.zeros(0) for name, each in left.items()}
@@ -500,11 +500,11 @@ def _untold(case: _Case, lamps: Mapping[str, Light]) -> Iterator[str]:
     """Lamps whose places the images do not tell; and what they never tell."""
     if not lamps:
         return
-    tolerance = np.linalg.inv(case.given.precision[-PER_CAMERA:-1, -PER_CAMERA:-1])
+    tolerance = np.linalg.inv(case.prior.precision[-PER_CAMERA:-1, -PER_CAMERA:-1])
     open_ones = [
         name
         for name, lamp in lamps.items()
-        if np.trace(known(lamp.covariance)[:3, :3]) > _TOLD**2 * np.trace(tolerance)
+        if np.trace(require_covariance(lamp.covariance)[:3, :3]) > _TOLD**2 * np.trace(tolerance)
     ]
     if open_ones:
         yield (

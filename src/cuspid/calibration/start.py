@@ -116,7 +116,7 @@ def board_pose(view: BoardView, board: Target, camera: Camera) -> Rigid3:
     raise InputError("calibration: no pose explains a view of the board")
 
 
-def joined(
+def join_cameras(
     views: Views, board: Target, cameras: Mapping[str, Camera], instants: Sequence[str]
 ) -> tuple[BoardScene, dict[tuple[str, str], BoardView]]:
     """The cameras in the frame of the first one, the board at each instant, and the views with a common numbering.
@@ -145,7 +145,7 @@ def joined(
     return scene, {key: chosen[key] for key in views}
 
 
-def renumbered(found: Adjusted, views: Views, board: Target) -> tuple[BoardScene, Views] | None:
+def renumber_instant(found: Adjusted, views: Views, board: Target) -> tuple[BoardScene, Views] | None:
     """The views with the corners at some instant numbered otherwise, where a board that is not quite even fits much
     better so, and the scene with the board turned likewise; None if there is no such instant."""
     # Where the board was at other moments tells nothing about the numbering at this one.

@@ -137,7 +137,7 @@ def _foretold(
     grid = board.tags
     places = grid.corners[grid.corners_of(np.array(list(found))).ravel()]
     pixels, tree = np.concatenate(list(found.values())), cKDTree(places)
-    beside = {int(each) for tag in new for each in grid.beside(tag)} - set(found)
+    beside = {int(each) for tag in new for each in grid.neighbours(tag)} - set(found)
     for tag in sorted(beside):
         own = grid.corners[grid.corners_of(np.array([tag]))[0]]
         far, near = tree.query(own.mean(axis=0), k=min(_AROUND, len(places)))

@@ -31,7 +31,7 @@ def follow_each_other(frame: Mapping[str, int]) -> bool:
     return 2 * near >= len(numbers)
 
 
-def untied(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
+def allow_delays(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
     """A scene whose cameras need not have exposed together; as yet, without delays."""
     timing = Timing(frame=frame, near={}, by_camera=dict.fromkeys(scene.cameras, 0.0), by_view={})
     return _choose_instants(scene, timing, scene.rig_from_board, views)

@@ -35,7 +35,7 @@ from cuspid.report.figures.calibration import (
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Range
 from cuspid.simulation.board_images import PhotographOptions, take_photographs
-from cuspid.simulation.manufacturing import ManufacturingOptions, built
+from cuspid.simulation.manufacturing import ManufacturingOptions, sample_built
 
 BoardFiles = Annotated[tuple[Path, ...], arg(name="board")]
 """Boards that are described by files."""
@@ -95,7 +95,7 @@ def photograph(
     """
     settings = {"board": board, "options": options, "manufacturing": manufacturing}
     hashes = {"handpiece": storage.hash_file(handpiece)}
-    true = built(storage.read_handpiece(handpiece), manufacturing)
+    true = sample_built(storage.read_handpiece(handpiece), manufacturing)
     with storage.claimed_folder(out, "photograph", settings, hashes), show_progress() as progress:
         take_photographs(true, board, out, options, progress=progress)
     console.print(f"{out / 'images'}: {options.instants} instants of {len(true.rig.names)} cameras")
@@ -195,6 +195,7 @@ def _figures(found: RigCalibration, board: Target) -> dict[str, object]:
         **(bent if board.terraces == 1 else steps),
         **({"boards": _boards(found, board)} if isinstance(board, BoardSet) else {}),
         "board_distance_mm": found.distance_mm,
+        "frames_per_s": found.frames_per_s,
         "cameras": {
             name: {**asdict(each), "widened": found.widened[name], "lens": _lens_figures(found.lenses[name])}
             for name, each in found.cameras.items()

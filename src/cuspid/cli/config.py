@@ -24,7 +24,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import read_text
-from cuspid.runtime.values import one_line, shown
+from cuspid.runtime.values import one_line, quote
 from cuspid.storage.files import write_bytes
 
 READ, WRITE = "--config", "--write-config"
@@ -108,7 +108,7 @@ def _arguments(verb: str, options: Mapping[str, Option], file: Path) -> list[str
             raise InputError(f"{file}: {verb} has no option {one_line(name)}{meant}")
         if not _is_taken(value, options[name].hint):
             raise InputError(
-                f"{file}: {name} is {shown(value)}, which it cannot be; cuspid {verb} --help-all lists its options"
+                f"{file}: {name} is {quote(value)}, which it cannot be; cuspid {verb} --help-all lists its options"
             )
         arguments += _as_arguments(name, value, options[name].hint)
     return arguments

@@ -12,7 +12,7 @@ from cuspid import storage
 from cuspid.cli.shared import console
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Range
-from cuspid.runtime.values import MOST_PX, named
+from cuspid.runtime.values import MOST_PX, join_names
 from cuspid.storage.calibrations import (
     MOST_LOST_PX,
     Loss,
@@ -59,7 +59,7 @@ def convert(
     _tell(target, carried.losses, carried.notes, max_px)
     write_calibration(target, carried.rig, kind, working_distance_mm)
     names = list(read.rig.names)
-    said = f"{target}: {kind}, {len(names)} camera(s) ({named(names)}), from {read.format}"
+    said = f"{target}: {kind}, {len(names)} camera(s) ({join_names(names)}), from {read.format}"
     console.print(said, soft_wrap=True, highlight=False)
 
 

@@ -107,7 +107,7 @@ def design(
         outline = handpiece_outline(found.handpiece, wanted.thickness_mm)
         save_design_picture(out / "design.png", found.handpiece, below, outline, title=wanted.name)
     for condition in found.best.assessment.conditions:
-        console.print(f"{'met   ' if condition.met else 'missed'} {condition}")
+        console.print(f"{'met   ' if condition.is_met else 'missed'} {condition}")
     console.print(
         f"{out / 'handpiece.json'}: {len(found.handpiece.rig.names)} cameras, the best of {found.evaluations} designs; "
         f"mean bound {found.best.assessment.mean_bound_um:.1f} µm, {found.best.assessment.unseen:.1%} unseen"

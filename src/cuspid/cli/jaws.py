@@ -23,7 +23,7 @@ from cuspid.anatomy.preparation.prepare import (
     preset,
 )
 from cuspid.anatomy.preparation.prepare import prepare as prepare_teeth
-from cuspid.anatomy.shape.boxed import boxed
+from cuspid.anatomy.shape.boxed import box_crowns
 from cuspid.cli.shared import Flat, Source, console, load_source, show_progress
 from cuspid.model.jaw import Jaw
 from cuspid.report.figures.drawing import save_picture
@@ -128,7 +128,7 @@ def box(
         jaw: Mesh of a jaw with tooth labels, for example the mean of a shape model; default: the built-in phantom.
         out: Mesh file to write, with a picture beside it.
     """
-    _write_jaw(out, lambda: boxed(load_source(jaw, source)), "boxed jaw")
+    _write_jaw(out, lambda: box_crowns(load_source(jaw, source)), "boxed jaw")
 
 
 def _write_jaw(path: Path, make: Callable[[], Jaw], title: str) -> Jaw:

@@ -163,7 +163,7 @@ def _follow_feed(feed: _Feed, out: Path, options: ReconstructionOptions, view: G
                 changed = {} if session is None else _describe_corrections(session)
             else:
                 session = session or Session(feed.handpiece, feed.source(), out, options)
-                changed = words.of(session.push(frame))
+                changed = words.report(session.push(frame))
             if view is not None and session is not None:
                 view.show(session, changed, words.lost)
     except KeyboardInterrupt:
@@ -200,7 +200,7 @@ class _Words:
         self.lost = 0
         """Number of the latest frames that could not be placed."""
 
-    def of(self, step: Step) -> Mapping[int, Mesh]:
+    def report(self, step: Step) -> Mapping[int, Mesh]:
         """Tell of a step; what it changed."""
         if step.rig_from_world is None:
             back = "" if self._last is None else f"; go back to where frame {self._last} was taken"

@@ -23,7 +23,7 @@ from cuspid.pipeline.panorama import MeshViewOptions, StitchOptions
 from cuspid.report.figures.panorama import save_camera_path
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.progress import Progress
-from cuspid.runtime.values import named
+from cuspid.runtime.values import join_names
 from cuspid.runtime.workers import map_in_threads
 from cuspid.stitching.ortho import Stitched
 
@@ -183,4 +183,4 @@ def left_out(frames: Iterable[FrameUse]) -> list[str]:
     for frame in frames:
         if not frame.used and frame.reason is not None and not frame.reason.startswith("in part "):
             names.setdefault(frame.reason.split(":")[0], []).append(frame.name)
-    return [f"{len(each)} frames, {reason}: {named(each)}" for reason, each in names.items()]
+    return [f"{len(each)} frames, {reason}: {join_names(each)}" for reason, each in names.items()]

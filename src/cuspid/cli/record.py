@@ -23,10 +23,10 @@ from cuspid.cli.shared import Flat, console
 from cuspid.footage.cameras import CameraSource, ExposureOptions, Ready
 from cuspid.footage.devices import FormatOptions, V4L2Camera, cameras_there
 from cuspid.footage.played import FilmCamera, RenderedCamera
-from cuspid.footage.quality import look, seen
+from cuspid.footage.quality import measure_quality, shrink_to_grey
 from cuspid.footage.record import Recording, RecordOptions, Status, Together, require_names
 from cuspid.model.board import Board, Target
-from cuspid.report.preview import Preview, marked
+from cuspid.report.preview import Preview, mark_focus
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Options, Range
 from cuspid.runtime.values import checked_name
@@ -227,7 +227,7 @@ class _Watch:
             self._told = advice
             console.print(counts, *news, sep="\n", soft_wrap=True, highlight=False)
         if self._preview is not None:
-            self._preview.show({name: marked(rgb, self._cells(name)) for name, rgb in shown.items()}, advice)
+            self._preview.show({name: mark_focus(rgb, self._cells(name)) for name, rgb in shown.items()}, advice)
         return self._options.until_enough and self._coverage.is_enough(self._enough)
 
     def say_coverage(self) -> None:
@@ -267,7 +267,7 @@ class _Watch:
         for name, each in status.items():
             looks = ["-"] * 4
             if name in shown:
-                level, _, white, sharpness, _ = look(seen(shown[name]), None)
+                level, _, white, sharpness, _ = measure_quality(shrink_to_grey(shown[name]), None)
                 self._best[name] = max(self._best[name], sharpness)
                 best = sharpness / self._best[name] if self._best[name] > 0 else 0.0
                 looks = [f"{sharpness:.3f}", f"{100 * best:.0f} %", f"{100 * white:.1f} %", f"{level:.0f}"]

@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from cuspid import storage
 from cuspid.cli.report import report
-from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suited
+from cuspid.cli.shared import Flat, Probe, Source, console, load_probe, load_source, show_progress, suit_lights
 from cuspid.cli.study import require_packages, save_study
 from cuspid.pipeline.scan import ReconstructionOptions, SimulationOptions
 from cuspid.runtime.options import WORKERS
@@ -50,7 +50,7 @@ def repeat(
     """
     check_workers(workers, "repeat")
     require_packages("repeat")
-    probe = suited(probe, simulation.texture)
+    probe = suit_lights(probe, simulation.texture)
     trial = TrialOptions(simulation=simulation, reconstruction=reconstruction)
     kept = {"new_texture": options.new_texture}
     settings = {"repeat": kept, "study": study, "trial": trial, "source": source, "probe": probe}

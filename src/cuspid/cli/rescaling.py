@@ -20,7 +20,7 @@ from cuspid.report.figures.panorama import save_distances
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Range
 from cuspid.runtime.values import LONGEST_MM
-from cuspid.stitching.rescaling import MeasuredDistance, Rescaled, rescaled, scaled_pose
+from cuspid.stitching.rescaling import MeasuredDistance, Rescaled, rescale_panorama, scaled_pose
 from cuspid.storage.files import read_manifest
 from cuspid.storage.strips import read_scaled_strip, write_scaled_strip
 
@@ -57,7 +57,7 @@ def rescale(
     if "stitch" in read_manifest(out):
         raise InputError(f"rescale: {out}: holds a panorama of cuspid pano stitch; give another folder as --out")
     before, poses = storage.read_panorama(panorama), _poses(panorama)
-    found = rescaled(before, measured)
+    found = rescale_panorama(before, measured)
     strip = read_scaled_strip(panorama, found.factor) if (panorama / "strip.json").exists() else None
     hashes = {name: storage.hash_file(panorama / name) for name in ("panorama.json", "panorama.png", "source.npz")}
     with storage.claimed_folder(out, "rescale", {"distance": distance}, hashes, replace=True):

@@ -24,7 +24,7 @@ from cuspid.cli.shared import (
     load_source,
     print_expected,
     show_progress,
-    suited,
+    suit_lights,
 )
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.evaluation.margin import MarginError, cut_margins, margin_error
@@ -143,7 +143,7 @@ def evaluate(
 
 
 def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, options: SimulationOptions) -> None:
-    probe = suited(probe, options.texture)
+    probe = suit_lights(probe, options.texture)
     settings = {"source": source, "probe": probe, "simulation": options}
     given = {"jaw": mesh, "handpiece": probe.handpiece}
     hashes = {name: storage.hash_file(path) for name, path in given.items() if path is not None}
@@ -326,7 +326,7 @@ def _print_spheres(report: SphereReport) -> None:
 
 
 def _print_nominal(handpiece: Handpiece, options: NominalOptions) -> None:
-    assumed = options.of(handpiece)
+    assumed = options.for_handpiece(handpiece)
     console.print(
         "calibration: the handpiece file gives no uncertainties; it is taken as nominal, accurate (one sigma) to "
         f"{1000 * assumed.place_mm:.3g} µm and {assumed.turn_deg:g}° in the pose of each camera, "

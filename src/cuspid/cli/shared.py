@@ -138,7 +138,7 @@ def _require_places(path: Path, device: Handpiece) -> None:
         raise InputError(f"{path}: all {len(centres)} cameras are at one place, which shows no depth; give theirs")
 
 
-def suited(probe: Probe, texture: Preset) -> Probe:
+def suit_lights(probe: Probe, texture: Preset) -> Probe:
     """With the lights that suit the teeth, for a built-in design for which none are asked for."""
     if probe.handpiece is not None or probe.lights is not None:
         return probe

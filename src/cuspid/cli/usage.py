@@ -40,11 +40,13 @@ def show_help(prog: str, command: Callable[..., None], given: Sequence[str] = ()
     """Print the help of a verb, or of the kind that the arguments name, and exit."""
     about = None if every else _SHORT.format(summary=_summary(command), prog=prog)
     words = [word for word in given if not word.startswith("-")]
-    shown, registry = described(command, every=every)
+    shown, registry = describe_command(command, every=every)
     tyro.cli(shown, prog=prog, description=about, args=[*words, "--help"], registry=registry)
 
 
-def described(command: Callable[..., None], *, every: bool = True) -> tuple[Callable[..., None], ConstructorRegistry]:
+def describe_command(
+    command: Callable[..., None], *, every: bool = True
+) -> tuple[Callable[..., None], ConstructorRegistry]:
     """A verb as tyro should describe it, with the registry that it needs."""
     near = frozenset(_flat_option_classes(command))
 
@@ -70,7 +72,7 @@ def described(command: Callable[..., None], *, every: bool = True) -> tuple[Call
         return replace(found, fields=tuple(fields))
 
     @wraps(command)
-    def shown(*given: object, **options: object) -> None:
+    def run(*given: object, **options: object) -> None:
         command(*given, **options)
 
     taken, hints = signature(command), get_type_hints(command, include_extras=True)
@@ -78,10 +80,10 @@ def described(command: Callable[..., None], *, every: bool = True) -> tuple[Call
         each.replace(annotation=describe(each.name, hints[each.name], each.default))
         for each in taken.parameters.values()
     ]
-    del shown.__wrapped__  # which tyro would look at instead
-    shown.__signature__ = taken.replace(parameters=parameters)  # type: ignore[attr-defined]
-    shown.__annotations__ = {each.name: each.annotation for each in parameters}
-    return shown, registry
+    del run.__wrapped__  # which tyro would look at instead
+    run.__signature__ = taken.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    return run, registry
 
 
 def _flat_option_classes(command: Callable[..., None]) -> Iterator[Any]:

@@ -85,7 +85,7 @@ class _Rules:
             return closest.on_border
         return closest.past_border & (np.abs(closest.signed_mm) <= self.margin_mm)
 
-    def evaluated(self, closest: ClosestPoints) -> Bool[np.ndarray, "n"]:
+    def is_evaluated(self, closest: ClosestPoints) -> Bool[np.ndarray, "n"]:
         """Points that are evaluated."""
         return ~(self.unscannable(closest) | self.past_border(closest))
 
@@ -226,7 +226,7 @@ def _align(scan: Mesh, surface: SignedDistance, options: EvaluationOptions, rng:
 def _deviation_um(aligned: Mesh, surface: SignedDistance, rules: _Rules) -> Float[np.ndarray, "v"]:
     """Of each vertex, NaN where it is not evaluated."""
     closest = surface.closest_points(aligned.vertices)
-    return np.where(rules.evaluated(closest), 1000 * closest.signed_mm, np.nan)
+    return np.where(rules.is_evaluated(closest), 1000 * closest.signed_mm, np.nan)
 
 
 def _samples_of_scan(
@@ -240,7 +240,7 @@ def _samples_of_scan(
     """The samples, and the statistics of everything that was scanned."""
     points, _ = aligned.sample(options.samples, rng)
     closest = surface.closest_points(points)
-    evaluated = rules.evaluated(closest)
+    evaluated = rules.is_evaluated(closest)
     past_border = rules.past_border(closest)
     over, past = 100 * rules.unscannable(closest).mean(), 100 * past_border.mean()
     limit = f" by at most {rules.margin_mm:g} mm" if rules.reference_is_all else ""

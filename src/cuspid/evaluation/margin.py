@@ -194,14 +194,14 @@ def _stations(
     if length < 20 * step_mm or length < 8 * _TANGENT_MM:
         raise InputError(f"margin: a line of {length:.2f} mm is too short for sections every {step_mm:g} mm")
 
-    def at(s: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 3"]:
+    def interpolate(s: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 3"]:
         return np.column_stack([np.interp(s % length, run, line[:, axis]) for axis in range(3)])
 
     s = np.arange(0.0, length - step_mm / 2, step_mm)
-    chords = at(s + _TANGENT_MM) - at(s - _TANGENT_MM)
+    chords = interpolate(s + _TANGENT_MM) - interpolate(s - _TANGENT_MM)
     size = np.linalg.norm(chords, axis=1)
     straight = size > _STRAIGHT * 2 * _TANGENT_MM
-    return at(s)[straight], chords[straight] / size[straight, None], len(s)
+    return interpolate(s)[straight], chords[straight] / size[straight, None], len(s)
 
 
 def _axes(tangent: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:

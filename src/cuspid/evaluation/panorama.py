@@ -32,7 +32,7 @@ from cuspid.model.panorama import Panorama
 from cuspid.model.trueness import NOTHING, GroundTruth, ReferenceRender
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Options, Range
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 FEWEST_TEETH_PX = 200
 """Minimum number of sampled pixels that show teeth, for an alignment by geometry."""
@@ -273,7 +273,7 @@ def _poses_of(panorama: Panorama, truth: GroundTruth) -> list[Rigid3]:
         return list(known.values())
     unknown = next(name for name in names if name not in known)
     raise InputError(
-        f"truth: it has no frame {shown(unknown)}, and {len(known)} frames where the panorama has {len(names)}; "
+        f"truth: it has no frame {quote(unknown)}, and {len(known)} frames where the panorama has {len(names)}; "
         "give the truth of the film that was stitched"
     )
 

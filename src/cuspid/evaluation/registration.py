@@ -188,7 +188,7 @@ def best_scale(
     return float(1 / shrinking)
 
 
-def located(
+def locate_place(
     points: Float[np.ndarray, "n 3"],
     surface: SignedDistance,
     reference_from_scan: Rigid3,

@@ -76,7 +76,7 @@ def fit_body(
         if len(near) < options.min_points:
             raise InputError(f"only {len(near)} points of the scan lie on the body; {options.min_points} are needed")
         body_from_scan = refine(near, library, body_from_scan, RegistrationOptions())
-    return _checked(scan, library, body_from_scan, near, options)
+    return _verify_fit(scan, library, body_from_scan, near, options)
 
 
 def _nearby(scan: Mesh, body: Mesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
@@ -127,7 +127,7 @@ def _misfit_mm(points: Float[np.ndarray, "n 3"], library: SignedDistance, pose: 
     return float(np.minimum(np.abs(library.closest_points(pose.apply(points)).signed_mm), _TRUNCATED_MM).mean())
 
 
-def _checked(
+def _verify_fit(
     scan: Mesh, library: SignedDistance, body_from_scan: Rigid3, near: Float[np.ndarray, "n 3"], options: BodyOptions
 ) -> BodyFit:
     signed_mm = library.closest_points(body_from_scan.apply(near)).signed_mm

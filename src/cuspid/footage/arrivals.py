@@ -9,7 +9,7 @@ from cuspid.model.rig import Handpiece
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.image_files import read_image
 from cuspid.storage.captures import IMAGE_SUFFIXES, folders_of_images
-from cuspid.storage.files import finished
+from cuspid.storage.files import list_finished
 
 _State = tuple[int, int]
 """Size and time of modification of a file."""
@@ -87,7 +87,7 @@ class Arrivals:
     def _look(self, now_s: float) -> None:
         try:
             folders = folders_of_images(self._images) if self._images.is_dir() else set[str]()
-            there = {camera: finished(self._images / camera) for camera in sorted(folders)}
+            there = {camera: list_finished(self._images / camera) for camera in sorted(folders)}
         except InputError as error:  # a folder that is moved meanwhile, or closed to others
             self._pass_over(self._images, "not all of it can be entered", error)
             return

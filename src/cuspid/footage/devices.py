@@ -21,7 +21,7 @@ import numpy as np
 
 from cuspid.footage.cameras import ExposureOptions, Pixels, Ready, Setting, Shot
 from cuspid.footage.jpeg import whole_jpeg
-from cuspid.footage.quality import look, seen
+from cuspid.footage.quality import measure_quality, shrink_to_grey
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Options, Range
 
@@ -70,7 +70,7 @@ class FormatOptions(Options):
     """How long each camera runs before its exposure is held."""
 
 
-def opened(device: str) -> Device:
+def open_device(device: str) -> Device:
     """A device of Video4Linux, whose images are taken as they are. Raises InputError where it cannot be opened."""
     if not Path(device).exists():
         raise InputError(f"{device}: no such camera; cuspid record --list names those that are there")
@@ -103,7 +103,7 @@ class V4L2Camera:
         device: str,
         form: FormatOptions,
         *,
-        open_device: Callable[[str], Device] = opened,
+        open_device: Callable[[str], Device] = open_device,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._device, self._form, self._open, self._clock = device, form, open_device, clock
@@ -114,9 +114,9 @@ class V4L2Camera:
         """See the protocol."""
         self._capture = self._open(self._device)
         code, size = self._set_form()
-        before = self._run(self._form.settle_s)
+        before = self._grab(self._form.settle_s)
         settings = () if exposure.auto else self._hold(exposure)
-        after = self._run(self._form.settle_s / 2)
+        after = self._grab(self._form.settle_s / 2)
         times = np.array([each.time_s for each in (*before, *after)])
         self._is_stamped = self._is_stamped and bool((np.diff(times) > 0).all())
         return Ready(
@@ -167,7 +167,7 @@ class V4L2Camera:
             )
         return code, size
 
-    def _run(self, seconds: float) -> list[Shot]:
+    def _grab(self, seconds: float) -> list[Shot]:
         """Images of some seconds, at least a few. Raises InputError where they are damaged."""
         end_s, found, damaged = self._clock() + seconds, list[Shot](), 0
         while self._clock() < end_s or len(found) < _LEAST_IMAGES:
@@ -206,7 +206,10 @@ class V4L2Camera:
         if exposure.auto:
             yield "exposure, gain and white balance are left to the camera; do not calibrate light from these images"
             return
-        levels = [None if (rgb := each.rgb()) is None else look(seen(rgb), None)[0] for each in (before, after)]
+        levels = [
+            None if (rgb := each.rgb()) is None else measure_quality(shrink_to_grey(rgb), None)[0]
+            for each in (before, after)
+        ]
         first, second = (each or 0.0 for each in levels)
         ratio = max(first, 1.0) / max(second, 1.0)
         if exposure.exposure_ms is None and exposure.gain is None and not 1 / _UNLIKE < ratio < _UNLIKE:

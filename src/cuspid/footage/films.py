@@ -121,7 +121,7 @@ def _of_video(frame: VideoFrame, where: str, *, is_grey: bool) -> Image:
     return frame.grey() if is_grey else frame.rgb()
 
 
-def developed(stored: Image, options: DevelopmentOptions, where: str) -> Image:
+def develop_image(stored: Image, options: DevelopmentOptions, where: str) -> Image:
     """The image made from the stored one: demosaiced, and scaled to the full range. Raises InputError where it cannot
     be made."""
     if options.bits is not None and stored.dtype == np.uint16:

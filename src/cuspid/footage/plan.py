@@ -85,7 +85,7 @@ class Bad:
         """Kind of the reason, as one word."""
         return self.reason.partition(":")[0]
 
-    def dropped(self) -> Dropped:
+    def as_dropped(self) -> Dropped:
         """The image in the form that a capture stores."""
         return Dropped(what=f"camera {self.camera} of frame {self.frame}", reason=self.reason)
 

@@ -59,7 +59,7 @@ class Looks:
         return np.isfinite(self.level_dn)
 
 
-def seen(image: UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]) -> Float32[np.ndarray, "a b"]:
+def shrink_to_grey(image: UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]) -> Float32[np.ndarray, "a b"]:
     """An image, RGB or grey, in the form in which it is judged: small, with grey values up to 255."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, _LOOKED_AT_PX / max(grey.shape))
@@ -67,10 +67,11 @@ def seen(image: UInt8[np.ndarray, "h w *c"] | UInt16[np.ndarray, "h w *c"]) -> F
     return small.astype(np.float32) / (257 if grey.dtype == np.uint16 else 1)
 
 
-def look(
+def measure_quality(
     shown: Float32[np.ndarray, "a b"], before: Float32[np.ndarray, "a b"] | None
 ) -> tuple[float, float, float, float, float]:
-    """Level, brightness, burnt-out share, sharpness and change of an image from :func:`seen`, as in :class:`Looks`."""
+    """Level, brightness, burnt-out share, sharpness and change of an image, as in :class:`Looks`; from
+    :func:`shrink_to_grey`."""
     level = float(shown.mean())
     edges = cv2.Laplacian(cv2.GaussianBlur(shown, (0, 0), 1.0), cv2.CV_32F)
     change = float(np.abs(shown - before).mean()) if before is not None else np.nan

@@ -24,7 +24,7 @@ from cuspid.footage.slots import Slots
 from cuspid.runtime.errors import CuspidError, InputError, OutputError
 from cuspid.runtime.options import Options, Range
 from cuspid.storage.captures import IMAGE_SUFFIXES
-from cuspid.storage.files import AppendedTable, finished, write_bytes
+from cuspid.storage.files import AppendedTable, list_finished, write_bytes
 
 TABLE = "timestamps.csv"
 """Its columns are ``camera``, ``frame`` (the name of the image) and ``time`` (s)."""
@@ -248,7 +248,7 @@ def require_no_footage(folder: Path, cameras: Cameras) -> None:
         return
     for name in cameras:
         place = folder / name
-        if place.is_dir() and any(path.suffix.lower() in IMAGE_SUFFIXES for path in finished(place)):
+        if place.is_dir() and any(path.suffix.lower() in IMAGE_SUFFIXES for path in list_finished(place)):
             raise OutputError(f"{place}: holds images already; give another --out for this recording")
     if (folder / TABLE).exists():
         raise OutputError(f"{folder / TABLE}: is of another recording; give another --out")

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cuspid.footage.films import DevelopmentOptions, Film, FilmFrame, developed, frames_of, open_film, sizes_of
+from cuspid.footage.films import DevelopmentOptions, Film, FilmFrame, develop_image, frames_of, open_film, sizes_of
 from cuspid.footage.plan import Bad, Films, Plan
-from cuspid.footage.quality import Looks, look, seen
+from cuspid.footage.quality import Looks, measure_quality, shrink_to_grey
 from cuspid.model.capture import Capture, ImageFolder
 from cuspid.model.rig import Handpiece
 from cuspid.runtime.errors import InputError
@@ -60,12 +60,12 @@ def survey(films: Films, folder: Path, options: DevelopmentOptions, progress: Pr
     """Measures of each frame, by camera; kept in ``survey/``. Raises InputError where a film changes its image size."""
     stage = Stage("survey", folder, options, _CODE)
 
-    def of(film: Film) -> Looks:
+    def survey_film(film: Film) -> Looks:
         file = folder / "survey" / f"{film.camera}.npz"
         stage.make({"film": film.digest}, [file], lambda: write_arrays(file, vars(_looks(film, options, progress))))
         return Looks(**read_arrays(file, remedy="delete it"))
 
-    return dict(zip(films, map_in_threads(of, films.values()), strict=True))
+    return dict(zip(films, map_in_threads(survey_film, films.values()), strict=True))
 
 
 def _looks(film: Film, options: DevelopmentOptions, progress: Progress) -> Looks:
@@ -79,7 +79,7 @@ def _looks(film: Film, options: DevelopmentOptions, progress: Progress) -> Looks
         elif shown.shape != (size or shown.shape):
             raise InputError(f"{frame.where}: its size differs from the frames before it; cut the film there")
         else:
-            rows[frame.number] = (time, *look(shown, before), highest)
+            rows[frame.number] = (time, *measure_quality(shown, before), highest)
             size, before = shown.shape, shown
         progress(film.camera, frame.number + 1, max(film.length.frames, frame.number + 1))
     table = np.full((max(rows) + 1, 7), np.nan)
@@ -96,8 +96,8 @@ def _judge_image(frame: FilmFrame, options: DevelopmentOptions) -> tuple[np.ndar
         stored = frame.stored()
     except InputError:
         return None, 0.0
-    image = developed(stored, options, frame.where)
-    return seen(image), float(stored.max()) if stored.dtype == np.uint16 else 0.0
+    image = develop_image(stored, options, frame.where)
+    return shrink_to_grey(image), float(stored.max()) if stored.dtype == np.uint16 else 0.0
 
 
 # --- developing ------------------------------------------------------------------------------------------------------
@@ -120,7 +120,7 @@ def develop(
             wanted[camera][plan.numbers[frame.name][camera]] = images.path(frame.name, camera)
     map_in_threads(lambda film: _develop(film, wanted[film.camera], stage, options, progress), films.values())
     capture = Capture(
-        handpiece=handpiece, frames=plan.frames, source=images, left_out=tuple(map(Bad.dropped, plan.bad))
+        handpiece=handpiece, frames=plan.frames, source=images, left_out=tuple(map(Bad.as_dropped, plan.bad))
     )
     write_capture(folder, capture)
     return capture
@@ -147,5 +147,5 @@ def _write(frame: FilmFrame, path: Path, options: DevelopmentOptions) -> None:
     if frame.png is not None and options == DevelopmentOptions():
         write_bytes(path, read_bytes(frame.png, "image"))
         return
-    image = developed(frame.stored(), options, frame.where)
+    image = develop_image(frame.stored(), options, frame.where)
     write_image(path, image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2))

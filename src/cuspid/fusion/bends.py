@@ -14,7 +14,7 @@ _BENT_DEG = 20.0
 """Neighbouring normals differ by more beside an edge."""
 
 
-def bent(mesh: Mesh, rings: int) -> Bool[np.ndarray, "v"]:
+def find_bends(mesh: Mesh, rings: int) -> Bool[np.ndarray, "v"]:
     """The vertices beside which the surface bends, and so many rings of neighbours."""
     found = np.zeros(len(mesh.vertices), dtype=bool)
     _mark_bent(mesh.faces, mesh.vertex_normals, np.cos(np.deg2rad(_BENT_DEG)), found)
@@ -24,7 +24,7 @@ def bent(mesh: Mesh, rings: int) -> Bool[np.ndarray, "v"]:
     return found
 
 
-def halved(mesh: Mesh, marked: Bool[np.ndarray, "v"]) -> Mesh:
+def subdivide_edges(mesh: Mesh, marked: Bool[np.ndarray, "v"]) -> Mesh:
     """The same surface with a new vertex, without colour, in the middle of each side of a face both ends of which are
     marked. New vertices follow the old ones, in the order of these."""
     faces, count = mesh.faces, len(mesh.vertices)

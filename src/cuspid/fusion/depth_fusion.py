@@ -17,11 +17,11 @@ from typing import Annotated, no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from cuspid.fusion.bends import bent, halved
+from cuspid.fusion.bends import find_bends, subdivide_edges
 from cuspid.fusion.cleaning import hole_rims
 from cuspid.fusion.evidence import Evidence, colors_of, observe
 from cuspid.fusion.meshing import extract
-from cuspid.fusion.volume import Reached, SparseVolume
+from cuspid.fusion.volume import SparseVolume, VolumeUpdate
 from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.mesh import Mesh, used_vertices
@@ -76,7 +76,7 @@ class FusionOptions(Options):
         """Minimum weight of a voxel where there are so many frames."""
         return min(0.001 * frames, 0.01) if self.min_weight is None else self.min_weight
 
-    def resolved(self, detail_mm: float, footprint_mm: float) -> FusionOptions:
+    def resolve(self, detail_mm: float, footprint_mm: float) -> FusionOptions:
         """With the grid for a handpiece whose pixels have a footprint that may be less than the detail.
 
         Depths that scatter tell a slope to scatter / distance, averaged over (distance / footprint)**2 pixels: with a
@@ -142,15 +142,17 @@ def _votes(
     volume = SparseVolume(voxel_mm, options.truncation_voxels * voxel_mm)
     half = len(rig_from_world)
 
-    def reached(one: _Located) -> tuple[int, Reached]:
+    def prepare(one: _Located) -> tuple[int, VolumeUpdate]:
         evidence = Evidence.of(one.depth_map, jump_mm)
-        return one.number, volume.reached(evidence, one.cam_from_world, one.points_in_world())
+        return one.number, volume.prepare_update(evidence, one.cam_from_world, one.points_in_world())
 
-    for batch in map_batches(reached, _select_located(depth_maps, rig_from_world)):
+    for batch in map_batches(prepare, _select_located(depth_maps, rig_from_world)):
         volume.integrate([where for _, where in batch])
         progress(stage, batch[-1][0], 2 * half)
     rough = extract(volume, options.least_weight_for(half))
-    votes = Votes.on(halved(rough, bent(rough, _RINGS)) if options.finer_bends is not False else rough)
+    votes = Votes.empty(
+        subdivide_edges(rough, find_bends(rough, _RINGS)) if options.finer_bends is not False else rough
+    )
     del volume
 
     def in_view(one: _Located) -> Voter:
@@ -229,9 +231,9 @@ class Voter:
     """Number of its frame, starting from 1."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Votes:
-    """What the depth maps say about each vertex of a rough mesh; accumulated map by map."""
+    """What the depth maps say about each vertex of a rough mesh. Not frozen: it is an accumulator."""
 
     rough: Mesh
     """The zero level of the volume."""
@@ -253,7 +255,7 @@ class Votes:
     """Largest inverse variance (1/mm^2) that one of them states; 0 where none states any."""
 
     @staticmethod
-    def on(rough: Mesh) -> Votes:
+    def empty(rough: Mesh) -> Votes:
         """An empty tally for a mesh."""
         count = len(rough.vertices)
         chunks = [rough.vertices[start : start + CHUNK] for start in range(0, count, CHUNK)]

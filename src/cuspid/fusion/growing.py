@@ -17,7 +17,7 @@ from cuspid.fusion.cleaning import hole_rims
 from cuspid.fusion.depth_fusion import FusionOptions
 from cuspid.fusion.evidence import Evidence, colors_of
 from cuspid.fusion.meshing import extract, extract_parts, part_of
-from cuspid.fusion.volume import BLOCK, SparseVolume, around, find, pack
+from cuspid.fusion.volume import BLOCK, SparseVolume, find, neighbour_keys, pack
 from cuspid.geometry import Rigid3
 from cuspid.model.mesh import Mesh
 from cuspid.model.reconstruction import DepthMap
@@ -49,12 +49,12 @@ class GrowingSurface:
         for depth_map in depth_maps:
             self._blend(depth_map, rig_from_world, take_out=True)
 
-    def changed(self) -> dict[int, Mesh]:
+    def pop_changes(self) -> dict[int, Mesh]:
         """The parts of the coloured surface that changed since this was last asked for, by their keys, as they are now;
         parts are cubes of some blocks of voxels, and each has vertices of its own."""
         touched = np.array(sorted(self._changed), dtype=np.int64)
         self._changed.clear()
-        parts = np.unique(part_of(around(touched))).tolist() if len(touched) else []
+        parts = np.unique(part_of(neighbour_keys(touched))).tolist() if len(touched) else []
         found = extract_parts(self._volume, self._least_weight, parts)
         return {key: replace(mesh, colors=self._colors_at(mesh.vertices)) for key, mesh in found.items()}
 
@@ -67,9 +67,9 @@ class GrowingSurface:
         evidence = Evidence.of(depth_map, self._jump_mm)
         in_rig, pixel = depth_map.points_in_rig()
         points, cam_from_world = rig_from_world.inverse().apply(in_rig), depth_map.cam_from_rig @ rig_from_world
-        reached = self._volume.reached(evidence, cam_from_world, points)
-        self._volume.integrate([reached], take_out=take_out)
-        self._changed.update(reached.keys.tolist())
+        update = self._volume.prepare_update(evidence, cam_from_world, points)
+        self._volume.integrate([update], take_out=take_out)
+        self._changed.update(update.keys.tolist())
         self._paint(points, colors_of(depth_map)[pixel], -1.0 if take_out else 1.0)
 
     def _paint(self, points: Float[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"], sign: float) -> None:

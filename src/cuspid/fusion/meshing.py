@@ -15,7 +15,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from cuspid.fusion.volume import BLOCK, SparseVolume, around, find, pack, unpack
+from cuspid.fusion.volume import BLOCK, SparseVolume, find, neighbour_keys, pack, unpack
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.workers import map_slices
@@ -163,7 +163,7 @@ class _Grid:
         first and the second of the second triangle of each pair is in the block that the pair belongs to."""
         index_of_cell = np.full(self.distance.shape, -1, dtype=np.int32)
         origins = unpack(self.keys).astype(np.float64) * BLOCK
-        grid = (self.distance, self.weight, find(self.keys, around(self.keys)))
+        grid = (self.distance, self.weight, find(self.keys, neighbour_keys(self.keys)))
         blocks = len(self.keys)
         vertices = _rows(partial(_vertices, *grid, origins, min_weight, index_of_cell), blocks, np.float64)
         faces = _rows(partial(_faces, *grid, index_of_cell, min_weight), blocks, np.int64)
@@ -189,7 +189,7 @@ def extract_parts(volume: SparseVolume, min_weight: float, parts: Iterable[int])
     owned = keys[np.isin(part_of(keys), asked)]
     if len(owned) == 0:
         return found
-    near = np.flatnonzero(np.isin(keys, around(owned)))
+    near = np.flatnonzero(np.isin(keys, neighbour_keys(owned)))
     grid = _Grid(keys[near], volume.distance[near], volume.weight[near])
     vertices, faces, block = grid.surface(min_weight)
     part = np.repeat(part_of(grid.keys)[block[faces[::2, 2]]], 2)

@@ -18,8 +18,8 @@ from typing import Annotated, NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cuspid.fusion.bends import bent
-from cuspid.fusion.volume import around, pack
+from cuspid.fusion.bends import find_bends
+from cuspid.fusion.volume import neighbour_keys, pack
 from cuspid.model.mesh import Mesh, used_vertices
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.options import Options, Range
@@ -61,7 +61,7 @@ class SharpEdgeOptions(Options):
     evenly round, 0 for two planes."""
 
 
-def sharpened(mesh: Mesh, detail_mm: float, options: SharpEdgeOptions | None = None) -> tuple[Mesh, int]:
+def sharpen_edges(mesh: Mesh, detail_mm: float, options: SharpEdgeOptions | None = None) -> tuple[Mesh, int]:
     """The mesh with its sharp convex edges, and how many vertices were moved. Faces stay as they are, but for their
     corners.
 
@@ -70,7 +70,7 @@ def sharpened(mesh: Mesh, detail_mm: float, options: SharpEdgeOptions | None = N
     options = options or SharpEdgeOptions()
     if not options.enabled:
         return mesh, 0
-    candidates = bent(mesh, _RINGS)
+    candidates = find_bends(mesh, _RINGS)
     if not candidates.any():
         return mesh, 0
     near = _within_reach(mesh, candidates, options.reach * detail_mm)
@@ -92,7 +92,7 @@ def _move_to_edges(
 def _within_reach(mesh: Mesh, candidates: Bool[np.ndarray, "v"], reach_mm: float) -> Bool[np.ndarray, "f"]:
     """The faces that a candidate may reach, and some more: an edge is looked for in a small part of a mesh."""
     cells = pack(np.floor(mesh.vertices / reach_mm).astype(np.int64))
-    near = np.isin(cells, around(np.unique(cells[candidates])))
+    near = np.isin(cells, neighbour_keys(np.unique(cells[candidates])))
     return np.asarray(near[mesh.faces].any(axis=1))
 
 

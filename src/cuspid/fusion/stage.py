@@ -15,7 +15,7 @@ from cuspid.fusion.cleaning import CleaningOptions, clean
 from cuspid.fusion.depth_fusion import Fused, FusionOptions
 from cuspid.fusion.depth_fusion import find_holes as find_holes_of_depth_maps
 from cuspid.fusion.depth_fusion import fuse as fuse_depth_maps
-from cuspid.fusion.sharp_edges import SharpEdgeOptions, sharpened
+from cuspid.fusion.sharp_edges import SharpEdgeOptions, sharpen_edges
 from cuspid.geometry import Rigid3
 from cuspid.model.mesh import Mesh
 from cuspid.model.reconstruction import DepthMap, Expectation, Funnel, SurfacePoints, sum_funnels
@@ -83,7 +83,7 @@ def fuse(
         if not len(cleaned.faces):
             raise ReconstructionError(f"no surface: {_what_took_it(funnel, len(raw.mesh.faces))}")
         sigma_um = _sigma_um(cleaned, raw, expected)
-        mesh, moved = sharpened(cleaned, detail_mm, sharp_edges)
+        mesh, moved = sharpen_edges(cleaned, detail_mm, sharp_edges)
         scale: Literal["known", "unknown"] = "known" if has_scale else "unknown"
         write_json(
             files[0],

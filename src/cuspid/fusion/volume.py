@@ -42,8 +42,8 @@ def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
 
 
 @dataclass(frozen=True, eq=False)
-class Reached:
-    """A depth map, and where in the volume it has information."""
+class VolumeUpdate:
+    """A depth map, and the blocks of the volume that it reaches."""
 
     evidence: Evidence
     """What it says."""
@@ -74,12 +74,14 @@ class SparseVolume:
         """Packed coordinates of the blocks in order of their slots."""
         return np.fromiter(self._slot_of_key, dtype=np.int64, count=len(self._slot_of_key))
 
-    def reached(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> Reached:
-        """What a depth map with these points (world, mm) will change; independent of what was blended before."""
+    def prepare_update(
+        self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]
+    ) -> VolumeUpdate:
+        """The blocks that a depth map with these points (world, mm) will change, whatever was blended before."""
         nearest = evidence.nearest(self._reach_px(evidence, cam_from_world, points))
-        return Reached(evidence, cam_from_world, self._keys_around(points), nearest)
+        return VolumeUpdate(evidence, cam_from_world, self._keys_around(points), nearest)
 
-    def integrate(self, maps: Sequence[Reached], *, take_out: bool = False) -> None:
+    def integrate(self, maps: Sequence[VolumeUpdate], *, take_out: bool = False) -> None:
         """Blend depth maps into the volume, one after the other, or take out again what was blended so."""
         slots = [self._allocate(one.keys) for one in maps]
 
@@ -131,7 +133,7 @@ class SparseVolume:
         return slots
 
 
-def around(keys: Int[np.ndarray, "b"]) -> Int[np.ndarray, "b 27"]:
+def neighbour_keys(keys: Int[np.ndarray, "b"]) -> Int[np.ndarray, "b 27"]:
     """Keys of the blocks at offsets (-1..1)^3 from each block."""
     return pack(unpack(keys)[:, None] + (np.array(list(np.ndindex(3, 3, 3))) - 1))
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, Shaped
 from scipy.spatial.transform import Rotation
 
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 _Array = TypeVar("_Array", bound=np.ndarray)
 _ROUNDING = 1e-6
@@ -32,7 +32,7 @@ def read_only(array: _Array) -> _Array:
     return array
 
 
-def owned(array: _Array) -> _Array:
+def freeze(array: _Array) -> _Array:
     """``array`` itself, made read-only: for what nothing else refers to."""
     array.flags.writeable = False
     return array
@@ -93,10 +93,10 @@ class Rigid3:
         object.__setattr__(self, "translation", read_only(np.asarray(self.translation, dtype=np.float64)))
         if not _is_rotation(self.rotation):
             raise InputError(
-                f"rigid motion: {shown(self.rotation)} is not a rotation; it must be a 3 x 3 matrix without scale"
+                f"rigid motion: {quote(self.rotation)} is not a rotation; it must be a 3 x 3 matrix without scale"
             )
         if self.translation.shape != (3,) or not all(map(isfinite, self.translation.tolist())):
-            raise InputError(f"rigid motion: its translation is {shown(self.translation)}; it must be 3 finite numbers")
+            raise InputError(f"rigid motion: its translation is {quote(self.translation)}; it must be 3 finite numbers")
 
     @staticmethod
     def identity() -> Rigid3:
@@ -157,7 +157,9 @@ class Rigid3:
         return directions @ self.rotation.T
 
 
-def composed(motions: Sequence[Rigid3], first: Rigid3) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+def compose_motions(
+    motions: Sequence[Rigid3], first: Rigid3
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
     """Rotations and translations of ``motion @ first`` for each of the motions: fast, for thousands of them."""
     rotations = np.stack([each.rotation for each in motions])
     translations = np.stack([each.translation for each in motions])

@@ -45,7 +45,7 @@ from cuspid.handpiece.presets import PRESETS
 from cuspid.model.body import CAMERA_MM
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import read_text
-from cuspid.runtime.values import one_line, shown, title
+from cuspid.runtime.values import one_line, quote, title
 
 _LARGEST = 1e6
 """No figure is larger; NaN is none."""
@@ -126,7 +126,7 @@ class DesignBrief:
         _check(self.thickness_mm > 0, f"thickness_mm is {self.thickness_mm:g}; it must be positive")
         _check(len(self.surfaces) > 0, "[surfaces] is empty; name at least one that must be seen")
         for surface, share in self.surfaces.items():
-            _check(0 < share <= 1, f"the share of surface {shown(surface)} is {share:g}; it must lie between 0 and 1")
+            _check(0 < share <= 1, f"the share of surface {quote(surface)} is {share:g}; it must lie between 0 and 1")
         _check(self.cameras.max >= 2, f"cameras.max is {self.cameras.max}; depth needs at least two")
         _check(
             self.cameras.spacing_mm >= self.sensor.sensor_width_mm,
@@ -215,7 +215,7 @@ def _sensor(given: object) -> Optics:
     if "preset" not in own:
         return Optics(**{"name": "own sensor", **_figures(own, complete=True)})
     preset = own.pop("preset")
-    _check(preset in PRESETS, f"unknown sensor {shown(preset)}; choose one of {', '.join(PRESETS)}")
+    _check(preset in PRESETS, f"unknown sensor {quote(preset)}; choose one of {', '.join(PRESETS)}")
     return replace(PRESETS[preset], **_figures(own, complete=False))
 
 

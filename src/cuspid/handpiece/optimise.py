@@ -37,7 +37,7 @@ from cuspid.model.visibility import VisibilityOptions, visible_faces
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import SEED, Options, Range
 from cuspid.runtime.progress import Progress, silent
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 _REACH_MM = 11.0
 """Of the mesh around the middle of a tooth, so much is kept on all sides."""
@@ -83,7 +83,7 @@ class Section:
     """Positions of the handpiece."""
 
     @staticmethod
-    def near(
+    def cut(
         mesh: Mesh,
         tooth: Bool[np.ndarray, "f"],
         surfaces: Mapping[str, Bool[np.ndarray, "f"]],
@@ -111,7 +111,7 @@ class Condition:
     """Whether the limit is a lower one."""
 
     @property
-    def met(self) -> bool:
+    def is_met(self) -> bool:
         """Up to rounding."""
         return self.shortfall <= 1e-6
 
@@ -147,7 +147,7 @@ class Assessment:
     @property
     def unmet(self) -> tuple[Condition, ...]:
         """The conditions that are missed."""
-        return tuple(condition for condition in self.conditions if not condition.met)
+        return tuple(condition for condition in self.conditions if not condition.is_met)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -239,7 +239,7 @@ def _check_surfaces(brief: DesignBrief, sections: Sequence[Section]) -> None:
     for name in brief.surfaces:
         if name not in there:
             raise InputError(
-                f"brief: the surface {shown(name)} must be seen, but the teeth given have only "
+                f"brief: the surface {quote(name)} must be seen, but the teeth given have only "
                 f"{', '.join(sorted(there)) or 'none'}"
             )
 

@@ -10,7 +10,7 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import maximum_filter
 from scipy.spatial import KDTree
 
-from cuspid.geometry import Rigid3, lengths_along, owned, read_only
+from cuspid.geometry import Rigid3, freeze, lengths_along, read_only
 from cuspid.model.jaw import GUM, Jaw
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.workers import computed_once
@@ -48,11 +48,11 @@ class ArchCurve:
     @computed_once
     def lengths_mm(self) -> Float[np.ndarray, "n"]:
         """Length of the curve up to each sample."""
-        return owned(lengths_along(self.points))
+        return freeze(lengths_along(self.points))
 
     @computed_once
     def _tangents(self) -> Float[np.ndarray, "n 3"]:
-        return owned(np.gradient(self.points, self.lengths_mm, axis=0))
+        return freeze(np.gradient(self.points, self.lengths_mm, axis=0))
 
     def span_of(self, points: Float[np.ndarray, "m 3"]) -> tuple[float, float]:
         """The stretch of the curve (mm from its start) beside which most of the points lie."""

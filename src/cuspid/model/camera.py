@@ -23,7 +23,7 @@ from cuspid.geometry.cameras import (
     projection_derivatives,
 )
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 _MOST_SLOPE = float(np.tan(np.deg2rad(70.0)))
 """Of the rays at the border of an image without distortion."""
@@ -84,7 +84,7 @@ class Camera:
             reach = self.distortion[self.lens.names.index("reach")]
             raise InputError(f"camera: the reach of its grid must be positive, not {reach:g}")
         if not np.isfinite(self.parameters).all():
-            raise InputError(f"camera: its parameters are not finite: {shown(self.parameters)}")
+            raise InputError(f"camera: its parameters are not finite: {quote(self.parameters)}")
 
     @staticmethod
     def from_field_of_view(width: int, height: int, horizontal_fov_deg: float) -> Camera:
@@ -139,7 +139,7 @@ class Camera:
         """A pinhole camera with the same image size, focal length and principal point, taken as exact."""
         return replace(self, model="OPENCV", distortion=np.zeros(4), covariance=None)
 
-    def straightened(self) -> Camera:
+    def undistorted(self) -> Camera:
         """The pinhole camera that its images are resampled to: :meth:`as_pinhole`, or for an equidistant lens one of
         the same scale on the axis whose image is large enough for what is seen up to 70 degrees from it, each way."""
         if not self.lens.is_equidistant:
@@ -206,7 +206,7 @@ class Camera:
         return inner[np.isfinite(inner).all(axis=-1)]
 
     @cached_property
-    def shown(self) -> Bool[np.ndarray, "h w"] | None:
+    def valid_mask(self) -> Bool[np.ndarray, "h w"] | None:
         """Where in the image the lens shows something, by its model; None where it does so everywhere."""
         edge = np.linspace(0, 1, _RIM_TICKS)[:, None] * [self.width, self.height]
         corners = np.array([[0.0, 0.0], [1, 0], [0, 1], [1, 1]]) * [self.width, self.height]

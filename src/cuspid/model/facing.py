@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from cuspid.geometry import owned
+from cuspid.geometry import freeze
 from cuspid.model.mesh import Mesh, edges_of
 
 _SAMPLES, _DIRECTIONS = 3000, 64
@@ -66,7 +66,7 @@ def _note(mesh: Mesh, turned: Bool[np.ndarray, "f"]) -> str:
 def _flip_faces(mesh: Mesh, faces: Bool[np.ndarray, "f"]) -> Mesh:
     if not faces.any():
         return mesh
-    return Mesh(mesh.vertices, owned(np.where(faces[:, None], mesh.faces[:, [0, 2, 1]], mesh.faces)), mesh.colors)
+    return Mesh(mesh.vertices, freeze(np.where(faces[:, None], mesh.faces[:, [0, 2, 1]], mesh.faces)), mesh.colors)
 
 
 def _neighbours(mesh: Mesh) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"], Bool[np.ndarray, "e"]]:

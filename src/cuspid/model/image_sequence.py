@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from cuspid.model.camera import Camera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.image_files import read_image, recorded
+from cuspid.runtime.image_files import Pixels, as_8_bits, read_fine, undo_exif_orientation
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -27,6 +27,8 @@ class ImageSequence:
     """Calibration, or None if it is to be found from the images."""
     working_distance_mm: float | None = None
     """Nominal distance of the camera from the teeth, if the calibration states it."""
+    frames_per_s: float | None = None
+    """Rate of the film whose frames are numbered by their names; None where nothing states it."""
     notes: tuple[str, ...] = ()
     """What was found while reading, one line each."""
     orientations: tuple[int, ...] = ()
@@ -50,9 +52,13 @@ class ImageSequence:
 
     def image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """RGB image of a frame. Raises InputError where the file is missing, damaged, or of another size."""
-        image = read_image(self.paths[index])
+        return as_8_bits(self.fine_image(index))
+
+    def fine_image(self, index: int) -> Pixels:
+        """As :meth:`image`, with fractions of digital numbers (float32) where more than 8 bits are stored."""
+        image = read_fine(self.paths[index])
         if self.orientations:
-            image = np.ascontiguousarray(recorded(image, self.orientations[index]))
+            image = np.ascontiguousarray(undo_exif_orientation(image, self.orientations[index]))
         if image.shape[1::-1] != self.size:
             raise InputError(f"{self.paths[index]}: its size changed while it was in use; start again")
         return image

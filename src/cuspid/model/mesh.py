@@ -15,7 +15,7 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int, UInt8
 
-from cuspid.geometry import Rigid3, owned, read_only
+from cuspid.geometry import Rigid3, freeze, read_only
 from cuspid.runtime.display import Viewable
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.kernels import kernel
@@ -144,7 +144,7 @@ class Mesh(Viewable):
         normals = self.face_cross
         norms = np.linalg.norm(normals, axis=1, keepdims=True)
         normals /= np.where(norms > 0, norms, 1)
-        return owned(normals)
+        return freeze(normals)
 
     def normals_of(self, faces: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
         """Unit outward normals of some faces."""
@@ -153,13 +153,13 @@ class Mesh(Viewable):
     @computed_once
     def face_areas(self) -> Float[np.ndarray, "f"]:
         """Areas in mm^2."""
-        return owned(0.5 * np.linalg.norm(self.face_cross, axis=1))
+        return freeze(0.5 * np.linalg.norm(self.face_cross, axis=1))
 
     @computed_once
     def vertex_areas(self) -> Float[np.ndarray, "v"]:
         """A third of the total area of the faces around each vertex, mm^2."""
         shares = np.repeat(self.face_areas / 3, 3)
-        return owned(np.bincount(self.faces.ravel(), shares, minlength=len(self.vertices)))
+        return freeze(np.bincount(self.faces.ravel(), shares, minlength=len(self.vertices)))
 
     @computed_once
     def face_centres(self) -> Float[np.ndarray, "f 3"]:
@@ -168,14 +168,14 @@ class Mesh(Viewable):
         for corner in (1, 2):
             centres += self.vertices[self.faces[:, corner]]
         centres /= 3
-        return owned(centres)
+        return freeze(centres)
 
     @computed_once
     def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
         """Unit normals, the area-weighted mean of the adjoining faces."""
         summed = _summed_at_vertices(self.faces, self.face_cross, len(self.vertices))
         norms = np.linalg.norm(summed, axis=1, keepdims=True)
-        return owned(summed / np.where(norms > 0, norms, 1))
+        return freeze(summed / np.where(norms > 0, norms, 1))
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
@@ -196,8 +196,8 @@ class Mesh(Viewable):
         used = used_vertices(faces, len(self.vertices))
         number = np.zeros(len(self.vertices), dtype=np.int64)
         number[used] = np.arange(len(used))
-        colors = None if self.colors is None else owned(self.colors[used])
-        return Mesh(owned(self.vertices[used]), owned(number[faces]), colors)
+        colors = None if self.colors is None else freeze(self.colors[used])
+        return Mesh(freeze(self.vertices[used]), freeze(number[faces]), colors)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
         """Points distributed uniformly by area (stratified over the faces), and the face of each."""

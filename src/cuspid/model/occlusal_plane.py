@@ -43,7 +43,7 @@ def crown_tips(
     return np.asarray((heights == summits) & _on_plane(summits, heights, off_plane_mm))
 
 
-def levelled(
+def level_crowns(
     seen: Callable[[Rigid3], Float[np.ndarray, "h w 3"]],
     spacing_mm: float,
     tilt_sd_deg: float,

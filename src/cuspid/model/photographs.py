@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from cuspid.model.camera import Camera
 from cuspid.model.capture import Dropped, file_digest
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.image_files import image_size, read_as_stored, read_deep
+from cuspid.runtime.image_files import Pixels, image_size, read_as_stored, read_deep, read_fine
 from cuspid.runtime.values import checked_name
 
 UPRIGHT, _LYING = 1, (5, 6, 7, 8)
@@ -60,9 +60,10 @@ class Photograph:
             ]
         )
 
-    def pixels(self) -> UInt8[np.ndarray, "h w 4"]:
-        """RGB and opacity in the grid of the sensor. Raises InputError where it cannot be read or changed its size."""
-        image = read_as_stored(self.path)
+    def pixels(self) -> Pixels:
+        """RGB in the grid of the sensor, with fractions of digital numbers where more than 8 bits are stored. Raises
+        InputError where it cannot be read or changed its size."""
+        image = read_fine(self.path, upright=False)
         if image.shape[1::-1] != self.size:
             raise InputError(f"{self.path}: its size changed while it was in use; start again")
         return image
@@ -70,7 +71,7 @@ class Photograph:
     def counts(self) -> UInt8[np.ndarray, "h w"] | None:
         """Where the photograph counts (not zero), by its mask and its opacity; None: everywhere."""
         shown = None if self.mask is None else self._mask()
-        opacity = self.pixels()[..., 3] if self._may_be_transparent else None
+        opacity = read_as_stored(self.path)[..., 3] if self._may_be_transparent else None
         if opacity is None or opacity.all():
             return shown
         return opacity if shown is None else np.where(shown > 0, opacity, 0).astype(np.uint8)
@@ -163,9 +164,9 @@ class Photographs:
         """As :attr:`cuspid.model.capture.ImageSource.suffix`; that of the first one, where they differ."""
         return self.photographs[0].path.suffix
 
-    def read(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+    def read(self, frame: str, camera: str) -> Pixels:
         """As :meth:`cuspid.model.capture.ImageSource.read`, in the grid of the sensor."""
-        return np.ascontiguousarray(self[frame].pixels()[..., :3])
+        return np.ascontiguousarray(self[frame].pixels())
 
     def mask(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w"] | None:
         """Where an image counts (not zero); None: everywhere."""

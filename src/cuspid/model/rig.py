@@ -20,7 +20,7 @@ from cuspid.model.camera import Camera
 from cuspid.model.shutter import PLAIN, Shutter
 from cuspid.runtime.display import Viewable
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import checked_name, named, one_line, shown
+from cuspid.runtime.values import checked_name, join_names, one_line, quote
 from cuspid.runtime.workers import computed_once
 
 _NO_SIDE = 1e-3
@@ -69,7 +69,7 @@ class Rig:
     def __repr__(self) -> str:
         sizes = sorted({f"{each.camera.width} x {each.camera.height}" for each in self.cameras.values()})
         plural = "s" if len(self.cameras) > 1 else ""
-        return f"Rig({len(self.cameras)} camera{plural} of {named(sizes, 3)} px)"
+        return f"Rig({len(self.cameras)} camera{plural} of {join_names(sizes, 3)} px)"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -257,7 +257,7 @@ class Sensor:
         share = self.shot_noise_share
         return np.asarray(self.noise_dn * np.sqrt(1 - share + share * level_dn / MID_GREY_DN))
 
-    def transmitted(self, camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+    def relative_response(self, camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """Linear light that pixels of a camera show, relative to a camera of gain 1 without falloff."""
         return np.asarray(self.gain * np.exp(falloff_terms(camera, pixels) @ self.falloff))
 
@@ -333,7 +333,7 @@ class Handpiece(Viewable):
 
     def __repr__(self) -> str:
         return (
-            f"Handpiece({shown(self.name)}, {self.rig}, {len(self.lights)} lights, "
+            f"Handpiece({quote(self.name)}, {self.rig}, {len(self.lights)} lights, "
             f"{self.working_distance_mm:g} mm from the teeth)"
         )
 

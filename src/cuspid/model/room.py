@@ -18,7 +18,7 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cuspid.geometry import Rigid3, composed
+from cuspid.geometry import Rigid3, compose_motions
 from cuspid.model.body import CAMERA_MM, LED_MM, Body, nearest_box
 from cuspid.model.mesh import Mesh
 from cuspid.model.rig import Handpiece
@@ -71,7 +71,7 @@ class _Balls:
     radii: Float[np.ndarray, "b"]
 
     @staticmethod
-    def around(points: Float[np.ndarray, "n 3"]) -> _Balls:
+    def build(points: Float[np.ndarray, "n 3"]) -> _Balls:
         """Halved across the longest side of the box around them, again and again."""
         levels = max(0, int(np.log2(len(points) / _LEAF)))
         leaf = -(-len(points) // 2**levels)
@@ -118,7 +118,7 @@ class Room:
     def fits(self, rig_from_world: Rigid3, pose_from_rig: Sequence[Rigid3]) -> Bool[np.ndarray, "n"]:
         """Whether the body fits at each of several poses, given relative to one pose."""
         free = np.empty(len(pose_from_rig), dtype=np.bool_)
-        poses = composed(pose_from_rig, rig_from_world)
+        poses = compose_motions(pose_from_rig, rig_from_world)
         _fits(*poses, self._surface, self._solid, self.clearance_mm, free)
         return free
 
@@ -199,7 +199,7 @@ class Room:
 # A search for a handpiece asks many bodies about few meshes.
 @lru_cache(maxsize=8)
 def _balls_of(mesh: Mesh) -> _Balls:
-    return _Balls.around(surface_points(mesh, _APART_MM))
+    return _Balls.build(surface_points(mesh, _APART_MM))
 
 
 @lru_cache(maxsize=8)

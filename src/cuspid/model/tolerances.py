@@ -75,7 +75,7 @@ class NominalOptions(Options):
     k1: Annotated[float, Range(0, 1)] = 0.01
     """First term of the radial distortion."""
 
-    def of(self, handpiece: Handpiece) -> Tolerances:
+    def for_handpiece(self, handpiece: Handpiece) -> Tolerances:
         """The tolerances for a handpiece."""
         share = _NOMINAL_PLACE * handpiece.working_distance_mm
         return Tolerances(
@@ -93,7 +93,7 @@ def is_nominal(handpiece: Handpiece) -> bool:
     return any(each.covariance is None or each.camera.covariance is None for each in cameras)
 
 
-def held(handpiece: Handpiece) -> Handpiece:
+def without_covariances(handpiece: Handpiece) -> Handpiece:
     """The handpiece without covariances: as if it were built exactly as its file says."""
 
     def exact(each: MountedCamera) -> MountedCamera:

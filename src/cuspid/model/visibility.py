@@ -223,7 +223,7 @@ def slope_bounds(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarr
     """Least and greatest x/z and y/z of the rays through the border of the image."""
     ticks = np.linspace(0, 1, 20)
     border = np.array([[t, s] for t in ticks for s in ticks if t in (0, 1) or s in (0, 1)])
-    camera = camera.straightened() if camera.lens.is_equidistant else camera
+    camera = camera.undistorted() if camera.lens.is_equidistant else camera
     rays = camera.rim_rays(border * [camera.width, camera.height])[:, :2]
     return rays.min(axis=0), rays.max(axis=0)
 

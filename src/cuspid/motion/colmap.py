@@ -31,7 +31,7 @@ from cuspid.model.rig import Rig
 from cuspid.motion.bundle.adjustment import residuals_px
 from cuspid.runtime.errors import InputError, OutputError, ReconstructionError
 from cuspid.runtime.inputs import read_bytes
-from cuspid.storage.calibrations.lenses import ALL, carried
+from cuspid.storage.calibrations.lenses import ALL, convert_lens
 from cuspid.storage.files import digest_of, hash_file, whole_files
 
 ColmapModel: TypeAlias = pycolmap.Reconstruction
@@ -58,7 +58,7 @@ def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
 
 @lru_cache(maxsize=64)
 def _with_its_lens(camera: Camera) -> Camera:
-    return carried(camera, ALL)[0] if camera.lens.splined else camera
+    return convert_lens(camera, ALL)[0] if camera.lens.splined else camera
 
 
 def colmap_rigid(transform: Rigid3) -> pycolmap.Rigid3d:

@@ -21,7 +21,7 @@ from cuspid.motion.frontend.features import detect_all
 from cuspid.motion.frontend.odometry import searched_mm
 from cuspid.motion.frontend.pairs import IndexedFeatures, match_guided
 from cuspid.motion.frontend.pictures import Pictures
-from cuspid.motion.location import MotionOptions, indexed
+from cuspid.motion.location import MotionOptions, index_frame
 from cuspid.runtime.progress import Progress, silent
 
 _REACH_PX, _LEAST_MATCHES = 8.0, 10
@@ -39,7 +39,7 @@ def epipolar_offset_px(
     features = detect_all(Pictures(capture, max_bytes=0), options.sought, progress=progress, cache=cache)
     pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
     within, offsets = replace(options.within, tolerance_px=_REACH_PX), list[float]()
-    for views in (indexed(handpiece.rig, features, name) for name in frames):
+    for views in (index_frame(handpiece.rig, features, name) for name in frames):
         for first, second in (pair for pair in pairs if all(name in views for name in pair)):
             a, b = views[first], views[second]
             b_from_a = handpiece.rig[second].cam_from_rig @ handpiece.rig[first].cam_from_rig.inverse()

@@ -27,7 +27,7 @@ from cuspid.motion.frontend.features import Features, detect_all
 from cuspid.motion.frontend.odometry import Edge, relative_pose, triangulate_frame
 from cuspid.motion.frontend.pairs import match_unguided
 from cuspid.motion.frontend.pictures import Pictures
-from cuspid.motion.location import MotionOptions, indexed
+from cuspid.motion.location import MotionOptions, index_frame
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import computed_once, map_in_threads
@@ -171,7 +171,7 @@ class _Matches:
     ) -> _Matches:
         names = handpiece.rig.names
 
-        def matched(pair: tuple[int, int]) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k 2"]]:
+        def match(pair: tuple[int, int]) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k 2"]]:
             found = [(np.zeros((0, 2)), np.zeros((0, 2)))]
             for frame in frames:
                 one, other = (features.get((frame, names[k])) for k in pair)
@@ -181,7 +181,7 @@ class _Matches:
             first, second = zip(*found, strict=True)
             return np.concatenate(first), np.concatenate(second)
 
-        return _Matches(handpiece, dict(zip(pairs, map_in_threads(matched, pairs), strict=True)))
+        return _Matches(handpiece, dict(zip(pairs, map_in_threads(match, pairs), strict=True)))
 
     @property
     def counts(self) -> Int[np.ndarray, "c c"]:
@@ -279,7 +279,7 @@ class _Motion:
         names, rig = self.handpiece.rig.names, self.handpiece.rig
         camera = {name: names[k] for name, k in zip(names, slots, strict=True)}
         assigned = {(frame, camera[image]): each for (frame, image), each in self.features.items()}
-        views = [indexed(rig, assigned, frame) for frame in self.frames]
+        views = [index_frame(rig, assigned, frame) for frame in self.frames]
         pairs = _pairs(self.handpiece, self.options)
         clouds = [triangulate_frame(self.handpiece, pairs, each, self.options.within) for each in views[:-1]]
         steps = zip(clouds, pairwise(views), strict=True)

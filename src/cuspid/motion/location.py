@@ -252,7 +252,7 @@ def _require_enough(trajectory: Trajectory, clouds: Sequence[Cloud], options: Mo
     )
 
 
-def loosened(options: MotionOptions, handpiece: Handpiece) -> MotionOptions:
+def loosen_tolerances(options: MotionOptions, handpiece: Handpiece) -> MotionOptions:
     """Options with tolerances that allow for an uncertain calibration."""
     slack_px = 2 * calibration_sigma_px(handpiece.rig, handpiece.working_distance_mm)
     within, odometry, across = options.within, options.odometry, options.across_frames
@@ -264,7 +264,7 @@ def loosened(options: MotionOptions, handpiece: Handpiece) -> MotionOptions:
     )
 
 
-def indexed(rig: Rig, features: Mapping[tuple[str, str], Features], frame: str) -> FrameFeatures:
+def index_frame(rig: Rig, features: Mapping[tuple[str, str], Features], frame: str) -> FrameFeatures:
     """The keypoints of one frame, ready to be matched, by the cameras of the rig that have some."""
     there = ((camera, features.get((frame, camera)), mounted) for camera, mounted in rig.cameras.items())
     return {camera: index_features(found, mounted.camera) for camera, found, mounted in there if found is not None}
@@ -286,19 +286,19 @@ def locate_features(
     it, keypoint positions are not refined.
     """
     given, handpiece = handpiece.rig.names, replace(handpiece, rig=handpiece.rig.in_own_order())
-    options = loosened(options, handpiece)
-    taken = {name: indexed(handpiece.rig, features, name) for name in names}
+    options = loosen_tolerances(options, handpiece)
+    taken = {name: index_frame(handpiece.rig, features, name) for name in names}
     refined = read if options.least_squares.enabled else None
     if not is_rolling(handpiece.rig, names):
-        found = _located(handpiece, taken, taken, options, refined, progress)
+        found = _locate_indexed(handpiece, taken, taken, options, refined, progress)
     else:
-        rough = _located(handpiece, taken, taken, _roughly(options, handpiece), None, progress)
-        found = _located(handpiece, taken, _at_instants(taken, rough), options, refined, progress)
+        rough = _locate_indexed(handpiece, taken, taken, _loosen_for_rolling(options, handpiece), None, progress)
+        found = _locate_indexed(handpiece, taken, _at_instants(taken, rough), options, refined, progress)
     noted = with_advice(found, options.odometry.min_matches)
     return noted.with_cameras_as(given)
 
 
-def _roughly(options: MotionOptions, handpiece: Handpiece) -> MotionOptions:
+def _loosen_for_rolling(options: MotionOptions, handpiece: Handpiece) -> MotionOptions:
     """With tolerances for what moves between the rows of an image."""
     slack_px = _ROLLING_SHARE * float(np.mean([each.camera.height for each in handpiece.rig.cameras.values()]))
     within, odometry, across = options.within, options.odometry, options.across_frames
@@ -314,7 +314,7 @@ def _at_instants(taken: Mapping[str, FrameFeatures], found: Reconstruction) -> d
     """The keypoints where they would have been seen at the instants of the frames, by poses that are about right."""
     made = unrollings(found)
 
-    def moved(frame: str, camera: str, view: IndexedFeatures) -> IndexedFeatures:
+    def unroll(frame: str, camera: str, view: IndexedFeatures) -> IndexedFeatures:
         unrolling = made.get((frame, camera))
         if unrolling is None or not len(view.features):
             return view
@@ -322,11 +322,11 @@ def _at_instants(taken: Mapping[str, FrameFeatures], found: Reconstruction) -> d
         return index_features(features, found.rig[camera].camera)
 
     return {
-        frame: {camera: moved(frame, camera, view) for camera, view in views.items()} for frame, views in taken.items()
+        frame: {camera: unroll(frame, camera, view) for camera, view in views.items()} for frame, views in taken.items()
     }
 
 
-def _located(
+def _locate_indexed(
     handpiece: Handpiece,
     taken: Mapping[str, FrameFeatures],
     at_instants: Mapping[str, FrameFeatures],

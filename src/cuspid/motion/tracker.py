@@ -18,7 +18,7 @@ from cuspid.model.rig import Handpiece
 from cuspid.motion.frontend.features import Features
 from cuspid.motion.frontend.odometry import Cloud, Edge, FrameFeatures, relative_pose, triangulate_frame
 from cuspid.motion.frontend.revisits import WORDS, look, typical
-from cuspid.motion.location import MotionOptions, indexed, loosened
+from cuspid.motion.location import MotionOptions, index_frame, loosen_tolerances
 
 Recall = Callable[[str], Mapping[tuple[str, str], Features]]
 """The keypoints of an earlier frame, by frame and camera."""
@@ -40,7 +40,7 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Seen:
+class _PlacedFrame:
     """A frame that was placed."""
 
     name: str
@@ -53,10 +53,10 @@ class Tracker:
     few; those of others are recalled where the path was lost."""
 
     def __init__(self, handpiece: Handpiece, options: MotionOptions, recall: Recall) -> None:
-        self._handpiece, self._options = handpiece, loosened(options, handpiece)
+        self._handpiece, self._options = handpiece, loosen_tolerances(options, handpiece)
         self._pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
         self._recall = recall
-        self._recent = deque[_Seen](maxlen=options.odometry.reach)
+        self._recent = deque[_PlacedFrame](maxlen=options.odometry.reach)
         self._lost = False
         self._looks = dict[str, Float[np.ndarray, "d"]]()
         self._words: Float[np.ndarray, "k 128"] | None = None
@@ -65,17 +65,17 @@ class Tracker:
 
     def push(self, name: str, features: Mapping[tuple[str, str], Features]) -> Placed:
         """Place the next frame."""
-        frame = self._seen(name, features)
+        frame = self._index(name, features)
         least = self._options.odometry.min_matches
         if len(frame.cloud.points) < least:
-            return self._left(f"only {len(frame.cloud.points)} points seen in stereo; {least} are needed")
+            return self._lose(f"only {len(frame.cloud.points)} points seen in stereo; {least} are needed")
         if not self.rig_from_world:
-            return self._kept(frame, Rigid3.identity(), None)
+            return self._keep(frame, Rigid3.identity(), None)
         found = self._beside_the_last(frame) or self._where_it_has_been(frame)
         if found is None:
-            return self._left(f"fewer than {least} matches to the frames before, or too small a share of them agreed")
+            return self._lose(f"fewer than {least} matches to the frames before, or too small a share of them agreed")
         other, target_from_source = found
-        return self._kept(frame, target_from_source @ self.rig_from_world[other.name], other.name)
+        return self._keep(frame, target_from_source @ self.rig_from_world[other.name], other.name)
 
     def correct(self, rig_from_world: Mapping[str, Rigid3]) -> None:
         """Take better poses of the frames so far; those that are not among them are no longer placed."""
@@ -85,13 +85,13 @@ class Tracker:
         self._lost = len(kept) < len(self._recent)
         self._recent = deque(kept, maxlen=self._recent.maxlen)
 
-    def _seen(self, name: str, features: Mapping[tuple[str, str], Features]) -> _Seen:
-        views = indexed(self._handpiece.rig, features, name)
-        return _Seen(
+    def _index(self, name: str, features: Mapping[tuple[str, str], Features]) -> _PlacedFrame:
+        views = index_frame(self._handpiece.rig, features, name)
+        return _PlacedFrame(
             name=name, views=views, cloud=triangulate_frame(self._handpiece, self._pairs, views, self._options.within)
         )
 
-    def _kept(self, frame: _Seen, rig_from_world: Rigid3, beside: str | None) -> Placed:
+    def _keep(self, frame: _PlacedFrame, rig_from_world: Rigid3, beside: str | None) -> Placed:
         self._lost = False
         self.rig_from_world[frame.name] = rig_from_world
         self._recent.append(frame)
@@ -102,31 +102,31 @@ class Tracker:
             self._looks[frame.name] = look(descriptors, self._words)
         return Placed(rig_from_world=rig_from_world, beside=beside, reason=None)
 
-    def _left(self, reason: str) -> Placed:
+    def _lose(self, reason: str) -> Placed:
         self._lost = True
         return Placed(rig_from_world=None, beside=None, reason=reason)
 
-    def _beside_the_last(self, frame: _Seen) -> tuple[_Seen, Rigid3] | None:
+    def _beside_the_last(self, frame: _PlacedFrame) -> tuple[_PlacedFrame, Rigid3] | None:
         """The frame before, if that could be placed and this one beside it."""
         if self._lost or not self._recent:
             return None
         edge = self._edge(self._recent[-1], frame)
         return None if edge.target_from_source is None else (self._recent[-1], edge.target_from_source)
 
-    def _where_it_has_been(self, frame: _Seen) -> tuple[_Seen, Rigid3] | None:
+    def _where_it_has_been(self, frame: _PlacedFrame) -> tuple[_PlacedFrame, Rigid3] | None:
         """Of the last frames and those that look most like this one, the one that it has most in common with."""
         tried = [*self._recent, *self._look_alikes(frame)]
         edges = [(other, self._edge(other, frame)) for other in tried]
         found = [(other, e.target_from_source, e.matches) for other, e in edges if e.target_from_source is not None]
         return max(found, key=lambda one: one[2])[:2] if found else None
 
-    def _edge(self, source: _Seen, target: _Seen) -> Edge:
+    def _edge(self, source: _PlacedFrame, target: _PlacedFrame) -> Edge:
         options = self._options
         return relative_pose(
             self._handpiece.rig, source.cloud, source.views, target.views, options.odometry, options.seed
         )
 
-    def _look_alikes(self, frame: _Seen) -> list[_Seen]:
+    def _look_alikes(self, frame: _PlacedFrame) -> list[_PlacedFrame]:
         """Frames long before, as recalled."""
         if self._words is None:
             return []
@@ -134,4 +134,4 @@ class Tracker:
         tried = {seen.name for seen in self._recent}
         likeness = {name: float(code @ other) for name, other in self._looks.items() if name not in tried}
         best = sorted(likeness, key=likeness.__getitem__, reverse=True)[:_CANDIDATES]
-        return [self._seen(name, self._recall(name)) for name in best]
+        return [self._index(name, self._recall(name)) for name in best]

@@ -68,7 +68,7 @@ class Resolution:
     working_distance_mm: float
     """The distance at which that holds."""
 
-    def at(self, depth_mm: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    def depth_step_mm(self, depth_mm: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Change of depth, in mm, that shifts the images as much as one resolution does at the working distance."""
         return self.mm * (depth_mm / self.working_distance_mm) ** 2
 
@@ -151,9 +151,11 @@ def _tolerance_mm(
 ) -> Float[np.ndarray, "h w"]:
     """How far from each other the depths of two of so many cameras may be."""
     if cameras == 2:
-        usual = options.pair_agreement * resolution.at(one.depth_mm)
+        usual = options.pair_agreement * resolution.depth_step_mm(one.depth_mm)
     else:
-        usual = np.maximum(options.agreement * resolution.at(one.depth_mm), options.agreement_sigmas * one.sigma_mm)
+        usual = np.maximum(
+            options.agreement * resolution.depth_step_mm(one.depth_mm), options.agreement_sigmas * one.sigma_mm
+        )
     return usual if one.smooth is None else np.where(one.smooth, options.smooth_sigmas * one.sigma_mm, usual)
 
 
@@ -195,7 +197,7 @@ def _shift_values(values: Float[np.ndarray, "h w"], down: int, right: int) -> Fl
 
 def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:
     """True where the standard deviation of the depth is small enough; that of a smooth surface is known to be large."""
-    sure = np.asarray(one.sigma_mm <= options.max_sigma * resolution.at(one.depth_mm))
+    sure = np.asarray(one.sigma_mm <= options.max_sigma * resolution.depth_step_mm(one.depth_mm))
     return sure if one.smooth is None else sure | one.smooth
 
 

@@ -43,7 +43,7 @@ _GRAZING, _OBLIQUE = 0.05, 0.2
 is not known well enough."""
 
 
-class Seen(NamedTuple):
+class Glare(NamedTuple):
     """How the pixels of a depth map differ from the shade of their surface."""
 
     mirrored: Float32[np.ndarray, "h w 3"]
@@ -55,12 +55,12 @@ class Seen(NamedTuple):
     where that is not known."""
 
 
-def seen(
+def estimate_glare(
     grid: Camera,
     depth_mm: Float[np.ndarray, "h w"],
     lights: Sequence[Light],
     exit_index: float,
-) -> Seen:
+) -> Glare:
     """What a first depth tells of each pixel of its grid, with lights in the frame of its camera and the refractive
     index of the surface."""
     rays = grid.rays(grid.pixel_centres().reshape(-1, 2)).reshape(grid.height, grid.width, 3)
@@ -72,10 +72,10 @@ def seen(
         normals = -unit(np.dstack([across, inverse - (across * rays[..., :2]).sum(axis=-1)]))
         known = np.isfinite(normals).all(axis=-1)
         points = rays[known] / inverse[known, None]
-        spot[known] = mirrored(points, normals[known], lights)
+        spot[known] = mirror_reflections(points, normals[known], lights)
         share[known] = _leaving(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
     past_pits, spot = spots
-    return Seen(spot, STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
+    return Glare(spot, STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
 
 
 def _smooth_depth(
@@ -95,7 +95,7 @@ def _mean_of_known(values: Float[np.ndarray, "h w"], window: int) -> Float[np.nd
     return np.where(weight > _LEAST_SHARE, total / np.maximum(weight, _LEAST_SHARE), np.nan)
 
 
-def mirrored(
+def mirror_reflections(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], lights: Sequence[Light]
 ) -> Float[np.ndarray, "n 3"]:
     """Mirror reflections as a share of the shade, channel by channel, of points (mm) with unit normals that a camera at

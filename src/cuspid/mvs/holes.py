@@ -55,18 +55,18 @@ class Sightings:
         points, count = np.unique(np.concatenate([np.zeros(0, np.int64), *shown]), return_counts=True)
         return points[count >= 2]
 
-    def confirmed(
+    def count_confirmations(
         self, depth_maps: Iterable[DepthMap], rig_from_world: Mapping[str, Rigid3], agreement_mm: float
     ) -> Int[np.ndarray, "p"]:
         """For each point, the number of depth maps of located frames that have it on their surface, whether or not
         their image shows it (keypoints come and go)."""
 
-        def confirmed(depth_map: DepthMap) -> Bool[np.ndarray, "p"]:
+        def on_surface(depth_map: DepthMap) -> Bool[np.ndarray, "p"]:
             cam_from_world = depth_map.cam_from_rig @ rig_from_world[depth_map.frame]
             return _on_surface(depth_map, cam_from_world.apply(self.points), agreement_mm)
 
         count = np.zeros(len(self.points), dtype=np.int64)
-        for points in map_ahead(confirmed, (each for each in depth_maps if each.frame in rig_from_world)):
+        for points in map_ahead(on_surface, (each for each in depth_maps if each.frame in rig_from_world)):
             count += points
         return count
 

@@ -38,7 +38,7 @@ class IdealView:
     name: str
     """Name in the rig."""
     camera: Camera
-    """The real camera without its distortion (:meth:`cuspid.model.camera.Camera.straightened`)."""
+    """The real camera without its distortion (:meth:`cuspid.model.camera.Camera.undistorted`)."""
     cam_from_rig: Rigid3
     """As for the real camera."""
     maps: tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]] | None
@@ -47,7 +47,7 @@ class IdealView:
     @staticmethod
     def of(name: str, mounted: MountedCamera) -> IdealView:
         """The ideal view of a mounted camera."""
-        ideal = mounted.camera.straightened()
+        ideal = mounted.camera.undistorted()
         return IdealView(name, ideal, mounted.cam_from_rig, undistortion_maps(mounted.camera, ideal))
 
     def resample(
@@ -135,7 +135,7 @@ def _field_of_view(mounted: MountedCamera, rect_from_rig: Float[np.ndarray, "3 3
     along_x, along_y = np.linspace(0, width, 9), np.linspace(0, height, 9)
     edge = [(x, y) for x in along_x for y in (0, height)] + [(x, y) for x in (0, width) for y in along_y]
     if mounted.camera.lens.is_equidistant:  # the border may lie behind the camera
-        ideal = mounted.camera.straightened()
+        ideal = mounted.camera.undistorted()
         return _field_of_view(replace(mounted, camera=ideal), rect_from_rig)
     rays = mounted.camera.rim_rays(np.array(edge, dtype=np.float64)) @ mounted.cam_from_rig.rotation @ rect_from_rig.T
     normalized = rays[:, :2] / np.maximum(rays[:, 2:], 0.2)

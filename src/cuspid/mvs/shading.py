@@ -33,10 +33,10 @@ from cuspid.geometry.semi_global import semi_global
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Light, Sensor
 from cuspid.mvs.confidence import ConfidenceOptions
-from cuspid.mvs.glare import seen
+from cuspid.mvs.glare import estimate_glare
 from cuspid.mvs.rectification import IdealView
 from cuspid.mvs.refinement import FAST, GroupGeometry, solve
-from cuspid.mvs.smoothing import smoothed
+from cuspid.mvs.smoothing import smooth
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.options import Options, Range
 
@@ -154,7 +154,7 @@ class _Fit(NamedTuple):
 
 def correction(camera: Camera, sensor: Sensor) -> Float32[np.ndarray, "h w 1"]:
     """What turns the digital numbers of a camera into those of one of gain 1 without falloff, pixel by pixel."""
-    return sensor.transmitted(camera, camera.pixel_centres())[..., None].astype(np.float32) ** (-1 / sensor.gamma)
+    return sensor.relative_response(camera, camera.pixel_centres())[..., None].astype(np.float32) ** (-1 / sensor.gamma)
 
 
 def brightness(
@@ -457,11 +457,11 @@ def shaded_depths(
         _Refinement(compared, hue, index, view, *how)
         for index, (view, hue) in enumerate(zip(views, _hues(blurred), strict=True))
     ]
-    found = [each.refined(compared, trust, _LENIENT) for each in refinements]
+    found = [each.refine(compared, trust, _LENIENT) for each in refinements]
     for _ in range(_ROUNDS):
         depths = [depth for depth, _ in found]
         compared, trust = compared_of(*_matte(blurred, views, depths, spacing_px, options))
-        found = [each.refined(compared, trust, 0) for each in refinements]
+        found = [each.refine(compared, trust, 0) for each in refinements]
     return found
 
 
@@ -480,14 +480,14 @@ def _matte(
     matte, trust = images.copy(), np.ones_like(images)
     for view, image, weight, depth in zip(views, matte, trust, depths, strict=True):
         part, encoded = np.s_[: view.size[0], : view.size[1]], np.float32(-1 / view.gamma)
-        what = seen(view.grid, depth, view.lights, options.exit_index)
+        what = estimate_glare(view.grid, depth, view.lights, options.exit_index)
         spot, uncertain, share = (_spread_values(each, view.size, spacing_px) for each in what)
-        weight[part] = trusted(image[part], uncertain, view.gamma, options.glare_dn)
+        weight[part] = trust_weights(image[part], uncertain, view.gamma, options.glare_dn)
         image[part] = np.where(image[part] >= 0, image[part] * ((1 + spot) * share[..., None]) ** encoded, _UNUSABLE)
     return matte, trust
 
 
-def trusted(
+def trust_weights(
     image: Float32[np.ndarray, "*n"], uncertain: Float32[np.ndarray, "*n"], gamma: float, glare_dn: float
 ) -> Float32[np.ndarray, "*n"]:
     """Weight of brightness (digital numbers) whose mirror reflections are uncertain by a share of the shade: half where
@@ -561,7 +561,7 @@ class _Refinement:
         )
         self._planes = _upsample_planes(coarse, every, self._rows, self._columns, spacing_px)
 
-    def refined(
+    def refine(
         self, images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"], lenient: int
     ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
         """Depth and standard deviation, from what was found before."""
@@ -570,7 +570,7 @@ class _Refinement:
         found = _refine_all(view, fit, self._rows, self._columns, self._planes)
         sigma = _SIGMA_PX * np.maximum(found[..., 1], _LEAST_VARIANCE) ** 0.25
         known = found[..., 2] > 0
-        q = smoothed(np.where(known, found[..., 0], np.nan), sigma, self._bend_px, self._colours)
+        q = smooth(np.where(known, found[..., 0], np.nan), sigma, self._bend_px, self._colours)
         self._restart(q)
         scale = self._geometry.scale
         return scale / q, _pool_sigma(sigma, known) * scale / q**2

@@ -33,7 +33,7 @@ _EDGE = 0.06
 """Difference of colours within three pixels (standard deviation) at which a bend costs half."""
 
 
-def smoothed(
+def smooth(
     values: Float[np.ndarray, "h w"],
     sigma: Float[np.ndarray, "h w"],
     bend: float,

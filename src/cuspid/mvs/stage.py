@@ -14,7 +14,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.capture import Capture, Frame
 from cuspid.model.pairing import camera_groups
 from cuspid.model.reconstruction import DepthMap, Reconstruction, SurfacePoints
-from cuspid.model.tolerances import held
+from cuspid.model.tolerances import without_covariances
 from cuspid.mvs.across import (
     AcrossOptions,
     measure_moving_cameras,
@@ -127,7 +127,7 @@ def measure_enough_depth(
     if found.tracks is None or left_share == 1:
         return depths
     sightings = Sightings.of(found, found.tracks)
-    missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < _ENOUGH_MAPS
+    missing = sightings.count_confirmations(depths, found.rig_from_world, agreement_mm) < _ENOUGH_MAPS
     between = _unmeasured_frames(capture, set(every_second), sightings, missing, left_share, options)
     return depths | measure_depth(
         *(replace(capture, frames=between), folder, options),
@@ -189,7 +189,7 @@ def measure_depth_across(
     left_share = _LEFT_SHARE if options.left_share is None else options.left_share
     if found.tracks is not None and left_share > 0:
         sightings = Sightings.of(found, found.tracks)
-        missing = sightings.confirmed(depths, found.rig_from_world, agreement_mm) < min_maps
+        missing = sightings.count_confirmations(depths, found.rig_from_world, agreement_mm) < min_maps
         tried = [(step, camera) for step in steps.values() for camera in step.now.cameras]
         taken = _that_fill_holes(tried, sightings, missing, left_share)
         if holes is not None:
@@ -220,7 +220,7 @@ class _Step:
     after: Frame
     motion: Rigid3
 
-    def of(self, cameras: Sequence[str]) -> _Step:
+    def with_cameras(self, cameras: Sequence[str]) -> _Step:
         """With these cameras only."""
         now, after = (replace(frame, cameras=tuple(cameras)) for frame in (self.now, self.after))
         return replace(self, now=now, after=after)
@@ -237,7 +237,7 @@ def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], stereo: Stere
             both = [camera for camera in cameras if camera in now.cameras and camera in after.cameras]
             moved = [c for c in both if moving_pair(capture.handpiece, c, motion, stereo.pairing) is not None]
             if moved:
-                steps[now.name] = _Step(now, after, motion).of(moved)
+                steps[now.name] = _Step(now, after, motion).with_cameras(moved)
     return steps
 
 
@@ -276,7 +276,7 @@ def _of_cameras(tried: Sequence[tuple[_Step, str]], taken: set[int]) -> dict[str
     for step, camera in (tried[index] for index in sorted(taken)):
         steps[step.now.name] = step
         cameras.setdefault(step.now.name, []).append(camera)
-    return {name: step.of(cameras[name]) for name, step in steps.items()}
+    return {name: step.with_cameras(cameras[name]) for name, step in steps.items()}
 
 
 def _following(located: Sequence[Frame]) -> dict[str, Frame]:
@@ -298,7 +298,7 @@ def _measure_all(
     stage: Stage,
     progress: Progress,
 ) -> StoredDepthMaps:
-    handpiece = hash_handpiece(held(capture.handpiece))  # how well it is known makes no depth
+    handpiece = hash_handpiece(without_covariances(capture.handpiece))  # how well it is known makes no depth
     files = [stage.folder / f"{frame.name}.npz" for frame in frames]
 
     def keep(one: tuple[Frame, Path]) -> str:

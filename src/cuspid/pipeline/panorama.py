@@ -47,6 +47,7 @@ from cuspid.motion.rig_film import (
     surface_patches,
 )
 from cuspid.runtime.errors import InputError, ReconstructionError
+from cuspid.runtime.image_files import as_8_bits
 from cuspid.runtime.plugins import load_plugin
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import computed_once
@@ -187,7 +188,7 @@ def stitch_rig(capture: Capture, options: StitchOptions = StitchOptions(), *, pr
         raise InputError("stitch: --method thesis takes the images of one camera; give the folder of one camera")
     if options.scale != ScaleOptions():
         raise InputError("stitch: the cameras of the handpiece tell the scale; leave out --scale")
-    capture = replace(capture, handpiece=NominalOptions().of(capture.handpiece).fill(capture.handpiece))
+    capture = replace(capture, handpiece=NominalOptions().for_handpiece(capture.handpiece).fill(capture.handpiece))
     found = locate_rig_film(capture, options.rig, options.motion, progress=progress)
     scene = _RigScene(unroll_capture(capture, found), found, options)
     shown, notes = scene.surface(progress), tuple[str, ...]()
@@ -226,7 +227,7 @@ class _RigScene:
     def read(self, name: str) -> UInt8[np.ndarray, "h w 3"]:
         """The image ``camera/frame``, or that of a frame and the camera whose picture it is."""
         one, _, frame = name.rpartition("/")
-        return self.capture.source.read(frame, one or self.camera)
+        return as_8_bits(self.capture.source.read(frame, one or self.camera))
 
     def surface(self, progress: Progress, before: Shown | None = None) -> Shown:
         """What cameras of one instant agree on; near what they showed ``before``."""

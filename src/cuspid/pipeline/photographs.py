@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -35,6 +34,7 @@ from cuspid.motion.monocular.scale import (
     scale_by_distances,
 )
 from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import visible_grey
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import map_in_threads
 from cuspid.storage.reconstructions import RECONSTRUCTION_FILES
@@ -162,7 +162,7 @@ def _sightings(photographs: Photographs, board: Board, progress: Progress) -> li
             image = photographs.read(name, "")
         except InputError:  # it is among the dropped
             return None
-        view = find_corners(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), board)
+        view = find_corners(visible_grey(image), board)
         return None if view is None else BoardSighting(frame=name, corner=view.corner, pixels=view.pixels)
 
     found = map_in_threads(find, photographs.names, stage="board", progress=progress)

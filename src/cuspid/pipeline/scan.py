@@ -39,7 +39,7 @@ from cuspid.model.mesh import Mesh
 from cuspid.model.pairing import detail_mm, stereo_pairs
 from cuspid.model.reconstruction import Reconstruction
 from cuspid.model.rig import Handpiece
-from cuspid.model.tolerances import NominalOptions, held, is_nominal
+from cuspid.model.tolerances import NominalOptions, is_nominal, without_covariances
 from cuspid.model.trueness import GroundTruth, Trueness
 from cuspid.model.unrolling import is_rolling, unroll_capture
 from cuspid.model.visibility import VisibilityOptions, scannable_faces
@@ -216,7 +216,7 @@ def _hold_what_fits(
         else f"its epipolar lines fit within {offset_px:.1f} px"
     )
     note = f"calibration: held as in the file, which states no uncertainty: {told}"
-    return replace(capture, handpiece=held(capture.handpiece)), (note,)
+    return replace(capture, handpiece=without_covariances(capture.handpiece)), (note,)
 
 
 def surface(
@@ -330,7 +330,7 @@ def _poses(found: Reconstruction, depths: StoredDepthMaps) -> dict[str, Rigid3]:
 def fusion_for(handpiece: Handpiece, options: ReconstructionOptions) -> FusionOptions:
     """How the depth maps of a handpiece are fused."""
     detail = detail_mm(handpiece)
-    fusion = options.fusion.resolved(detail, handpiece.footprint_mm)
+    fusion = options.fusion.resolve(detail, handpiece.footprint_mm)
     if options.quality != "fine" or options.fusion.voxel_mm is not None:
         return fusion
     return replace(fusion, voxel_mm=_FINE_VOXELS * fusion.voxel_for(detail))
@@ -372,8 +372,8 @@ def _resolve_draft(options: ReconstructionOptions) -> ReconstructionOptions:
 def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
     """The handpiece with the uncertainty that is assumed for it."""
     if options.calibration == "fixed":
-        return held(handpiece)
-    return options.nominal.of(handpiece).fill(handpiece)
+        return without_covariances(handpiece)
+    return options.nominal.for_handpiece(handpiece).fill(handpiece)
 
 
 # --- What a scan is compared with ------------------------------------------------------------------------------------

@@ -133,7 +133,7 @@ class Session:
             frame=frame.name,
             rig_from_world=placed.rig_from_world,
             reason=placed.reason,
-            changed=self._surface.changed(),
+            changed=self._surface.pop_changes(),
             seconds=time.perf_counter() - begin,
         )
 
@@ -148,7 +148,7 @@ class Session:
         self._tracker.correct(found.rig_from_world)
         for frame in self.frames:
             self._set_pose(frame, found.rig_from_world.get(frame.name))
-        return self._surface.changed()
+        return self._surface.pop_changes()
 
     def missing(self) -> Float[np.ndarray, "n 3"]:
         """Places (mm) on the rims of the holes in the surface."""

@@ -68,16 +68,16 @@ def _(value: Trueness, path: Path) -> None:
 
 @_save.register
 def _(value: Panorama, path: Path) -> None:
-    Image.fromarray(_fitted(value.image, 2 * _WIDTH_PX)).save(path)
+    Image.fromarray(_fit_size(value.image, 2 * _WIDTH_PX)).save(path)
 
 
 @_save.register
 def _(value: Capture, path: Path) -> None:
     frame = value.frames[len(value.frames) // 2]
-    Image.fromarray(_tiled([_fitted(image, _TILE_PX) for image in value.images(frame).values()])).save(path)
+    Image.fromarray(_tile([_fit_size(image, _TILE_PX) for image in value.images(frame).values()])).save(path)
 
 
-def _fitted(image: UInt8[np.ndarray, "h w 3"], max_px: int) -> UInt8[np.ndarray, "a b 3"]:
+def _fit_size(image: UInt8[np.ndarray, "h w 3"], max_px: int) -> UInt8[np.ndarray, "a b 3"]:
     """The image, made smaller where a side is longer."""
     scale = min(1.0, max_px / max(image.shape[:2]))
     if scale == 1:
@@ -86,7 +86,7 @@ def _fitted(image: UInt8[np.ndarray, "h w 3"], max_px: int) -> UInt8[np.ndarray,
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _tiled(images: list[UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndarray, "h w 3"]:
+def _tile(images: list[UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndarray, "h w 3"]:
     """Images side by side, in rows, on white."""
     columns = min(len(images), _MOST_COLUMNS)
     rows = -(-len(images) // columns)

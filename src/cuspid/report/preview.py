@@ -19,7 +19,7 @@ _CONTRAST, _NOISE_DN = 0.2, 8.0
 _LACKING, _TINT = (255, 110, 20), 0.35
 
 
-def marked(
+def mark_focus(
     rgb: UInt8[np.ndarray, "h w 3"], covered: Float[np.ndarray, "r c"] | None = None
 ) -> UInt8[np.ndarray, "a b 3"]:
     """A small image for focusing: sharp edges are green, and parts that the board has not covered (0 to 1) are

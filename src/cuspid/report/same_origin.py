@@ -74,11 +74,11 @@ def only_own_pages(bound: str) -> Iterator[None]:
 
     serve, started = server.serve, []
 
-    def guarded(*given: Any, process_request: Answer, **options: Any) -> Any:
+    def serve_guarded(*given: Any, process_request: Answer, **options: Any) -> Any:
         started.append(bound)
         return serve(*given, process_request=_guard_handler(process_request, bound), **options)
 
-    server.serve = guarded  # type: ignore[misc, assignment]
+    server.serve = serve_guarded  # type: ignore[misc, assignment]
     try:
         yield
     finally:
@@ -90,10 +90,10 @@ def only_own_pages(bound: str) -> Iterator[None]:
 
 
 def _guard_handler(answer: Answer, bound: str) -> Answer:
-    def guarded(connection: Any, request: Request) -> Any:
+    def handle(connection: Any, request: Request) -> Any:
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) == 1 and len(origins) < 2 and is_own(hosts[0], next(iter(origins), None), bound):
             return answer(connection, request)
         return connection.respond(HTTPStatus.FORBIDDEN, "cuspid: only pages from this server may access it\n")
 
-    return guarded
+    return handle

@@ -48,16 +48,16 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     return _decode(path, "RGB")
 
 
-def read_fine(path: Path) -> Pixels:
+def read_fine(path: Path, *, upright: bool = True) -> Pixels:
     """As :func:`read_image`, but with fractions of its digital numbers (float32, below 256) where the file stores more
-    than 8 bits."""
+    than 8 bits; not ``upright``: in the grid of the sensor, whichever way the camera was held."""
     image_size(path)
     with _reading(path), Image.open(path) as image:
-        levels = _levels(path, image)
+        levels = _levels(path, image, upright=upright)
         if levels is not None:
             fine = (levels / np.float32(1 << (_bits_of(path, image) - 8))).astype(np.float32)
             return np.ascontiguousarray(fine[..., :3] if fine.ndim == 3 else np.repeat(fine[..., None], 3, axis=2))
-        return _as_8_bit(image, "RGB")
+        return _as_8_bit(image, "RGB", upright=upright)
 
 
 def as_8_bits(image: UInt8[np.ndarray, "*s"] | Float32[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s"]:
@@ -68,6 +68,11 @@ def as_8_bits(image: UInt8[np.ndarray, "*s"] | Float32[np.ndarray, "*s"]) -> UIn
 def visible_in_8_bits(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """An image of 8 bits as it is; of more bits those that show most of it, where it is dark."""
     return grey if grey.dtype == np.uint8 else brighten(grey)
+
+
+def visible_grey(image: Pixels) -> UInt8[np.ndarray, "h w"]:
+    """An RGB image in grey, as :func:`visible_in_8_bits`."""
+    return visible_in_8_bits(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
 
 
 def brighten(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
@@ -170,7 +175,7 @@ def recorded_size(path: Path) -> tuple[int, int]:
     return (height, width) if exif_orientation(path) in LYING else (width, height)
 
 
-def recorded(upright: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
+def undo_exif_orientation(upright: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """An image that was turned upright by its EXIF orientation, as the sensor recorded it."""
     # Each way is its own reverse, but for the two quarter turns, which are each other's.
     return _undo_exif_rotation(upright, {6: 8, 8: 6}.get(orientation, orientation))

@@ -47,11 +47,11 @@ def _one_at_a_time(compile_for: Callable[..., Any], cache: _KernelCache) -> Call
     """``Dispatcher.compile``, which takes what is on disk or compiles and stores it, in one process at a time."""
 
     @wraps(compile_for)
-    def locked(signature: object) -> Any:
-        with cache.locked():
+    def compile_locked(signature: object) -> Any:
+        with cache.hold_lock():
             return compile_for(signature)
 
-    return locked
+    return compile_locked
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
@@ -68,7 +68,7 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
         self._lock_path = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
+    def hold_lock(self) -> Iterator[None]:
         """Let no other thread or process compile this kernel; where files cannot be locked, no other thread."""
         with global_compiler_lock, ExitStack() as stack:  # in this order: a thread that compiles may wait for files
             with suppress(OSError):

@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import number, shown
+from cuspid.runtime.values import number, quote
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def _check(what: str, value: object, allowed: Range | Choices) -> None:
     elif isinstance(allowed, Range):
         number(what, value, float(allowed.low), float(allowed.high))
     elif value not in allowed:
-        raise InputError(f"{what} is {shown(value)}; choose {', '.join(map(str, allowed))}")
+        raise InputError(f"{what} is {quote(value)}; choose {', '.join(map(str, allowed))}")
 
 
 def _title(options: type) -> str:

@@ -35,7 +35,7 @@ def checked_name(what: str, value: object) -> str:
     character that some system does not allow in file names.
     """
     if not (isinstance(value, str) and len(value) <= _LONGEST_NAME and all(map(_can_be_a_file, value.split("/")))):
-        raise InputError(f"{what}: {shown(value)} cannot be used as a name; use letters, digits, - and _")
+        raise InputError(f"{what}: {quote(value)} cannot be used as a name; use letters, digits, - and _")
     return value
 
 
@@ -49,7 +49,7 @@ def title(what: str, value: object) -> str:
     """Text that fits in one line of a page or a picture. Raises InputError otherwise."""
     if not (isinstance(value, str) and value.isprintable() and len(value) <= _LONGEST_NAME):
         raise InputError(
-            f"{what} is {shown(value)}; it must be text of one line, of at most {_LONGEST_NAME} characters"
+            f"{what} is {quote(value)}; it must be text of one line, of at most {_LONGEST_NAME} characters"
         )
     return value
 
@@ -57,9 +57,9 @@ def title(what: str, value: object) -> str:
 def number(what: str, value: object, low: float, high: float) -> float:
     """A finite number between two bounds (inclusive). Raises InputError otherwise."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise InputError(f"{what} is {shown(value)}; it must be a number")
+        raise InputError(f"{what} is {quote(value)}; it must be a number")
     if not low <= value <= high:
-        raise InputError(f"{what} is {shown(value)}; it must lie between {low:g} and {high:g}")
+        raise InputError(f"{what} is {quote(value)}; it must lie between {low:g} and {high:g}")
     return float(value)
 
 
@@ -67,7 +67,7 @@ def whole(what: str, value: object, low: int, high: int) -> int:
     """An integer between two bounds (inclusive). Raises InputError otherwise."""
     found = number(what, value, float(low), float(high))
     if found != int(found):
-        raise InputError(f"{what} is {shown(value)}; it must be a whole number")
+        raise InputError(f"{what} is {quote(value)}; it must be a whole number")
     return int(found)
 
 
@@ -81,9 +81,9 @@ def numbers(what: str, value: Any, shape: tuple[int, ...], low: float, high: flo
         found = np.full(1, np.nan)
     if found.shape != shape:
         size = " x ".join(map(str, shape))
-        raise InputError(f"{what} is {shown(value)}; it must be {size} numbers")
+        raise InputError(f"{what} is {quote(value)}; it must be {size} numbers")
     if not np.all((found >= low) & (found <= high)):
-        raise InputError(f"{what} is {shown(value)}; each must lie between {low:g} and {high:g}")
+        raise InputError(f"{what} is {quote(value)}; each must lie between {low:g} and {high:g}")
     return found
 
 
@@ -112,16 +112,16 @@ def printable(text: str) -> str:
 
 def one_line(said: object) -> str:
     """A message from a library or a file, cut to one short line."""
-    return shown(" ".join(str(said).split()), longest=120)[1:-1]
+    return quote(" ".join(str(said).split()), longest=120)[1:-1]
 
 
-def shown(value: object, *, longest: int = _SHOWN) -> str:
+def quote(value: object, *, longest: int = _SHOWN) -> str:
     """A value for a message: short, on one line, without control characters."""
     text = repr(value if not isinstance(value, np.ndarray) else value.tolist()).replace("\n", " ")
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 
-def named(names: Sequence[str], most: int = 6) -> str:
+def join_names(names: Sequence[str], most: int = 6) -> str:
     """Names on one line; if there are many, those in the middle are left out."""
     if len(names) <= most:
         return ", ".join(names)

@@ -27,8 +27,8 @@ _Result = TypeVar("_Result")
 _BATCH_PER_CORE = 8
 
 START_METHOD: Literal["fork", "spawn"] = "fork" if sys.platform == "linux" else "spawn"
-"""How processes begin: as a copy of this one, with all that it has, or anew, with what they are given (:func:`packed`).
-Elsewhere than on Linux, system libraries do not survive a copy."""
+"""How processes begin: as a copy of this one, with all that it has, or anew, with what they are given
+(:func:`pickle_fields`). Elsewhere than on Linux, system libraries do not survive a copy."""
 
 
 class computed_once(cached_property[_Result]):
@@ -131,7 +131,7 @@ def map_slices(
     return [work(each) for each in slices] if count < few or len(slices) == 1 else map_in_threads(work, slices)
 
 
-def packed(value: object) -> bytes:
+def pickle_fields(value: object) -> bytes:
     """A value for a process that begins anew, which has it back by ``pickle.loads``. Of frozen values the fields are
     packed, and not what was computed from them: trees and scenes of libraries cannot leave their process."""
     stream = io.BytesIO()
@@ -144,7 +144,7 @@ class _Packer(pickle.Pickler):
         if isinstance(value, MappingProxyType):
             return _proxy, (dict(value),)
         if is_dataclass(value) and not isinstance(value, type):
-            return _unpacked, (type(value), {each.name: getattr(value, each.name) for each in fields(value)})
+            return _unpickle_fields, (type(value), {each.name: getattr(value, each.name) for each in fields(value)})
         return NotImplemented
 
 
@@ -152,7 +152,7 @@ def _proxy(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
     return MappingProxyType(values)
 
 
-def _unpacked(kind: type, values: dict[str, Any]) -> Any:
+def _unpickle_fields(kind: type, values: dict[str, Any]) -> Any:
     """The value bit for bit, and its arrays read-only as they were: kernels are compiled for such ones."""
     made: Any = object.__new__(kind)
     for name, value in values.items():

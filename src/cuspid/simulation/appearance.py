@@ -253,7 +253,7 @@ def gradient_noise(x, y, z):
 
 @kernel(fastmath=True)
 @no_type_check
-def stippled(normal, point, height_mm, noise_from_jaw):
+def stipple_normal(normal, point, height_mm, noise_from_jaw):
     """The unit normal of a surface on which a noise of this height lies (bump mapping; Blinn 1978)."""
     m = noise_from_jaw
     x = m[0, 0] * point[0] + m[0, 1] * point[1] + m[0, 2] * point[2] + m[0, 3]

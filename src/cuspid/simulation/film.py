@@ -15,7 +15,7 @@ from cuspid.model.rig import Handpiece
 from cuspid.model.trueness import GroundTruth
 from cuspid.runtime.progress import Progress, silent
 from cuspid.simulation.appearance import Preset
-from cuspid.simulation.lights import lit
+from cuspid.simulation.lights import with_default_lights
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
 from cuspid.simulation.reference_render import ReferenceRenderOptions, render_reference
 from cuspid.simulation.stage import RenderOptions, jaw_files, look_of, scene_of, take_images
@@ -46,7 +46,7 @@ def film(
     Also writes reference renders of the arch from above: ``truth/occlusal``, orthographic, and ``truth/shot``, from far
     above.
     """
-    handpiece = lit(handpiece)
+    handpiece = with_default_lights(handpiece)
     poses = plan_free_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     capture, truth = take_images(jaw, handpiece, poses, folder, options, progress=progress)
     for done, (name, height_mm) in enumerate(REFERENCE_RENDERS.items(), start=1):

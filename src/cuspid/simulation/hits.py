@@ -44,7 +44,7 @@ class Rays(NamedTuple):
     barycentric: np.ndarray
 
 
-def traced(mesh: Mesh, origins: Float[np.ndarray, "#n 3"], directions: Float[np.ndarray, "n 3"]) -> Rays:
+def trace(mesh: Mesh, origins: Float[np.ndarray, "#n 3"], directions: Float[np.ndarray, "n 3"]) -> Rays:
     """Rays with what each of them hits. ``origins``: one for each ray, or one for all."""
     directions = np.ascontiguousarray(directions)
     hits = mesh.cast(np.broadcast_to(origins, directions.shape), directions)
@@ -62,14 +62,14 @@ def first_hits(
     *,
     moving: bool = False,
 ) -> Rays:
-    """As :func:`traced`, for all rays of whole rows of pixels, ``samples`` consecutive ones for each pixel, few of
+    """As :func:`trace`, for all rays of whole rows of pixels, ``samples`` consecutive ones for each pixel, few of
     which are traced. ``firsts``: the first ray of each pixel, and of those in the row below, where there is one. All
     others are traced if neighbouring rays are ``moving`` against each other."""
     count = len(directions)
     faces, distances, barycentric = np.full(count, -1), np.full(count, np.inf), np.zeros((count, 3))
     rays = Rays(np.ascontiguousarray(origins), np.ascontiguousarray(directions), faces, distances, barycentric)
     left = _meet(surface, rays, firsts, samples, width, moving)
-    some = traced(mesh, rays.origins if len(origins) == 1 else rays.origins[left], rays.directions[left])
+    some = trace(mesh, rays.origins if len(origins) == 1 else rays.origins[left], rays.directions[left])
     faces[left], distances[left], barycentric[left] = some.faces, some.distances, some.barycentric
     return rays
 

@@ -15,7 +15,7 @@ _BESIDE = 0.1
 _log = logging.getLogger("cuspid")
 
 
-def lit(handpiece: Handpiece) -> Handpiece:
+def with_default_lights(handpiece: Handpiece) -> Handpiece:
     """The handpiece; if it has no lights, with one beside each camera, which is logged."""
     if handpiece.lights:
         return handpiece

@@ -59,7 +59,7 @@ class ManufacturingOptions(Options):
         )
 
 
-def built(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
+def sample_built(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     """One of the handpieces that are built to the tolerances; the drawn one if there are none."""
     rng = np.random.default_rng([options.manufacturing_seed, 3])
     placed = with_cameras(drawn, lambda mounted: _draw_error(mounted, options.tolerances, rng))
@@ -105,7 +105,7 @@ def _light(drawn: Light, options: ManufacturingOptions, rng: np.random.Generator
     )
 
 
-def told(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
+def with_tolerances(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     """The drawn handpiece with the tolerances as covariances; without tolerances it keeps its own covariances, or is
     exact."""
     return options.tolerances.fill(with_cameras(drawn, lambda mounted: _open(mounted, options.tolerances)))

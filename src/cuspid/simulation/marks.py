@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from cuspid.model.jaw import GUM, Jaw
 from cuspid.model.mesh import Mesh
-from cuspid.simulation.scattering import diffused
+from cuspid.simulation.scattering import diffuse
 
 _BROAD_MM, _FINE_MM = 2.0, 0.3
 """Lengths over which the surface is softened to tell hollows and fissures."""
@@ -74,7 +74,7 @@ def natural_marks(jaw: Jaw, seed: int) -> Marks:
 def hollow_mm(mesh: Mesh, length_mm: float) -> Float[np.ndarray, "v"]:
     """How far the surface, softened over a length, lies above each vertex, along its normal."""
     centred = mesh.vertices - mesh.vertices.mean(axis=0)  # what spreads is found as exactly as it is large
-    above = diffused(mesh, length_mm, centred) - centred
+    above = diffuse(mesh, length_mm, centred) - centred
     return np.asarray((above * mesh.vertex_normals).sum(axis=1))
 
 
@@ -87,7 +87,7 @@ def _far_from_gum(jaw: Jaw) -> Float[np.ndarray, "v"]:
     on_tooth = np.ones(len(jaw.mesh.vertices))
     if jaw.face_labels is not None:
         on_tooth[jaw.mesh.faces[jaw.face_labels == GUM]] = 0
-    return _ramp(diffused(jaw.mesh, _GUM_MM, on_tooth[:, None])[:, 0], 0.8, 1.0)
+    return _ramp(diffuse(jaw.mesh, _GUM_MM, on_tooth[:, None])[:, 0], 0.8, 1.0)
 
 
 def _attached_gum(jaw: Jaw) -> Float32[np.ndarray, "v"]:
@@ -107,7 +107,7 @@ def _patches(mesh: Mesh, rng: np.random.Generator) -> Float[np.ndarray, "v"]:
     """From 0 to 1, evenly, changing over a millimetre or so."""
     areas = mesh.vertex_areas
     white = rng.normal(size=len(areas)) / np.sqrt(np.where(areas > 0, areas, np.inf))  # some may be in no face
-    noise = diffused(mesh, _PATCH_MM, white[:, None])[:, 0]
+    noise = diffuse(mesh, _PATCH_MM, white[:, None])[:, 0]
     return np.asarray(noise.argsort().argsort() / max(len(noise) - 1, 1))
 
 

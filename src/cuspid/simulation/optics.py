@@ -71,8 +71,8 @@ class OpticsOptions(Options):
     """How far the handpiece moves during an exposure."""
     readout: Annotated[float | None, SHARE] = None
     """Rolling shutter: share (0 to 1) of the time from one frame to the next in which the rows are exposed one after
-    the other; 0 for all at once. The true pose of a frame is that of its middle. The capture's handpiece.json says so
-    (``readout``)."""
+    the other (the readout time of the sensor in s, times frames per s); 0 for all at once. The true pose of a frame is
+    that of its middle. The capture's handpiece.json says so (``readout``)."""
     delays_frames: Annotated[tuple[float, ...], Range(-1, 1)] = ()
     """How much later than the others each camera exposes, in the order of the handpiece, in shares of the time from one
     frame to the next; none for all together. The capture's handpiece.json says so (``delay_frames``)."""
@@ -89,7 +89,7 @@ class OpticsOptions(Options):
     """Quality of a JPEG compression of the images, before they are stored without loss."""
 
     @property
-    def settled(self) -> Optics:
+    def resolved(self) -> Optics:
         """With the values of the preset where no others are given."""
         preset = vars({"ideal": IDEAL, "clinical": CLINICAL}[self.optics])
         return Optics(
@@ -100,7 +100,7 @@ class OpticsOptions(Options):
 def with_shutters(handpiece: Handpiece, options: OpticsOptions) -> Handpiece:
     """A handpiece whose cameras expose as the options say. Raises InputError where there are not as many delays as
     cameras."""
-    readout, names = options.settled.readout, handpiece.rig.names
+    readout, names = options.resolved.readout, handpiece.rig.names
     if not readout and not options.delays_frames:
         return handpiece
     if options.delays_frames and len(options.delays_frames) != len(names):
@@ -157,14 +157,14 @@ def _defocus(light, depth, radius):
     return out
 
 
-def mixed(radiance: Float[np.ndarray, "h w 3"], optics: Optics) -> Float[np.ndarray, "h w 3"]:
+def mix_channels(radiance: Float[np.ndarray, "h w 3"], optics: Optics) -> Float[np.ndarray, "h w 3"]:
     """What the channels see of light of three colours."""
     if optics.crosstalk == 0:
         return radiance
     return optics.crosstalk * radiance.sum(axis=-1, keepdims=True) + (1 - 3 * optics.crosstalk) * radiance
 
 
-def recorded(image: UInt8[np.ndarray, "h w 3"], optics: Optics) -> UInt8[np.ndarray, "h w 3"]:
+def encode_image(image: UInt8[np.ndarray, "h w 3"], optics: Optics) -> UInt8[np.ndarray, "h w 3"]:
     """The image after the colour filter of its sensor and compression."""
     if optics.bayer:
         mosaic = image[..., 1].copy()

@@ -34,7 +34,7 @@ from cuspid.model.shutter import Shutter, screw_of
 from cuspid.runtime import workers
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.kernels import kernel
-from cuspid.runtime.workers import computed_once, packed
+from cuspid.runtime.workers import computed_once, pickle_fields
 from cuspid.simulation.appearance import (
     NO_MATERIAL,
     Appearance,
@@ -43,14 +43,14 @@ from cuspid.simulation.appearance import (
     face_materials,
     palette,
     scattering_mm,
-    stippled,
+    stipple_normal,
 )
-from cuspid.simulation.hits import Rays, ShadedMesh, dot, first_hits, normal_of, point_of, traced
+from cuspid.simulation.hits import Rays, ShadedMesh, dot, first_hits, normal_of, point_of, trace
 from cuspid.simulation.marks import natural_marks, no_marks
-from cuspid.simulation.optics import IDEAL, Optics, mixed, recorded, through_lens
+from cuspid.simulation.optics import IDEAL, Optics, encode_image, mix_channels, through_lens
 from cuspid.simulation.scattering import Scattering
 from cuspid.simulation.sensor import record
-from cuspid.simulation.shadows import NOTICEABLE, STEP, Lamps, darken, illuminated, incoming, lamps, segments
+from cuspid.simulation.shadows import NOTICEABLE, STEP, Lamps, darken, illuminate, incoming, lamps, segments
 
 _FILM_REFLECTANCE, _FILM_ROUGHNESS = 0.02, 0.03
 """Of a film of saliva (water): Fresnel reflectance at normal incidence, GGX roughness."""
@@ -118,7 +118,7 @@ class Scene:
         return Scattering(self.jaw.mesh, lengths) if lengths.any() else None
 
     @computed_once
-    def below(self) -> Callable[[str | None, Rigid3], Float[np.ndarray, "v 3"]]:
+    def light_from_below(self) -> Callable[[str | None, Rigid3], Float[np.ndarray, "v 3"]]:
         """The light that leaves each vertex from below under a lighting pattern, by the pose of the handpiece
         (``rig_from_world``), cached for the last ones; of no vertex where light does not travel below the surface."""
         return lru_cache(maxsize=_TOGETHER)(self._light_from_below)
@@ -161,7 +161,7 @@ def radiance(
 ) -> Float[np.ndarray, "h w 3"]:
     """Linear light at each pixel, or at those of one row, averaged over the pixel's area and, with a smear (rotation
     vector and shift of the jaw in its own frame during the exposure), over time; 0 where nothing is hit. ``below``: see
-    :attr:`Scene.below`."""
+    :attr:`Scene.light_from_below`."""
     rays = scene.rays(camera)
     if row is not None:
         rays = rays.reshape(camera.height, -1, 3)[row]
@@ -191,7 +191,7 @@ def _row_by_row(
     frame by ``motion`` (rotation vector and shift) from one frame to the next. The lights go along with the camera;
     what is softened below the surface is that of the middle row."""
     camera, rows = mounted.camera, []
-    below = scene.below(lighting, rig_from_world)
+    below = scene.light_from_below(lighting, rig_from_world)
     for row in range(camera.height):
         moved = mounted.shutter.late(np.array((row + 0.5) / camera.height)) * motion
         then = rig_from_world @ Rigid3.from_rotation_vector(moved[:3], moved[3:])
@@ -228,7 +228,7 @@ def _is_rolling(scene: Scene) -> bool:
     return scene.optics.readout > 0 or not all(each.shutter.is_plain for each in cameras)
 
 
-def smeared(motion: Float[np.ndarray, "6"], rig_from_world: Rigid3, smear_mm: float) -> Float[np.ndarray, "6"]:
+def limit_motion(motion: Float[np.ndarray, "6"], rig_from_world: Rigid3, smear_mm: float) -> Float[np.ndarray, "6"]:
     """The share of a motion in which the handpiece itself moves by ``smear_mm``; none if it only turns, or rests."""
     then = rig_from_world @ Rigid3.from_rotation_vector(motion[:3], motion[3:])
     way = float(np.linalg.norm(then.inverse().translation - rig_from_world.inverse().translation))
@@ -248,7 +248,7 @@ def radiance_along(
     """Linear light (float32) of rows of pixels, given their rays, ``supersampling**2`` consecutive ones for each pixel.
 
     Neighbouring rays have neighbouring origins, or one for all, unless they are ``moving`` during the exposure.
-    ``below``: see :attr:`Scene.below`.
+    ``below``: see :attr:`Scene.light_from_below`.
     """
     samples = scene.supersampling**2
     row = samples * width
@@ -258,7 +258,7 @@ def radiance_along(
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         own, firsts = slice(top * row, bottom * row), slice(top * row, (bottom + 1) * row, samples)
-        grid = traced(scene.jaw.mesh, _some(origins, firsts), directions[firsts])
+        grid = trace(scene.jaw.mesh, _some(origins, firsts), directions[firsts])
         given = scene.jaw.mesh, scene.surface, _some(origins, own), directions[own]
         rays = first_hits(*given, grid, samples, width, moving=moving)
         _add_light(scene, rays, grid, lights, below, out[top:bottom])
@@ -280,7 +280,7 @@ def _add_light(
     """:func:`radiance_along` for some rows, into ``out``. ``grid``: the first rays of their pixels and of the row
     below."""
     samples, width = scene.supersampling**2, out.shape[1]
-    chosen, counts, light = illuminated(scene.jaw.mesh, scene.surface, rays, samples, lights, grid, width)
+    chosen, counts, light = illuminate(scene.jaw.mesh, scene.surface, rays, samples, lights, grid, width)
     points, materials = _places(rays, scene.surface)
     albedos = albedo(points, materials, scene.palette)
     _mark(rays, scene.surface, albedos)
@@ -382,7 +382,7 @@ def _shade(rays, albedos, surface, palette, lights, chosen, counts, light, sampl
             point, normal = point_of(rays, i), normal_of(rays, i, surface)
             if palette.stipple_mm[m] > 0:
                 height = palette.stipple_mm[m] * _interpolate_hit(rays, i, surface, surface.stippled)
-                normal = stippled(normal, point, height, palette.stipple_from_jaw)
+                normal = stipple_normal(normal, point, height, palette.stipple_from_jaw)
             albedo = (albedos[i, 0], albedos[i, 1], albedos[i, 2])
             direction = rays.directions[i]
             inverse = 1 / np.sqrt(dot(direction, direction))
@@ -432,7 +432,7 @@ def _entering(points, normals, heights, palette, reflectance, lights, shares):
     for i in range(len(points)):
         normal = (normals[i, 0], normals[i, 1], normals[i, 2])
         if heights[i] > 0:
-            normal = stippled(normal, points[i], heights[i], palette.stipple_from_jaw)
+            normal = stipple_normal(normal, points[i], heights[i], palette.stipple_from_jaw)
         for k in range(len(lights.positions)):
             towards, falloff = incoming(points[i], k, lights)
             cosine = max(0.0, dot(normal, towards))
@@ -452,7 +452,7 @@ def auto_gain(scene: Scene, poses: Iterable[Rigid3], lighting: str | None = None
         lights = lamps(scene.handpiece, lighting, rig_from_world)
         for mounted in scene.handpiece.rig.cameras.values():
             camera, cam_from_world = _coarser(mounted.camera, stride), mounted.cam_from_rig @ rig_from_world
-            coarse = radiance(scene, camera, cam_from_world, lights, scene.below(lighting, rig_from_world))
+            coarse = radiance(scene, camera, cam_from_world, lights, scene.light_from_below(lighting, rig_from_world))
             levels.append(level_of(coarse, axis=-1).ravel())
     seen = np.concatenate(levels)
     seen = seen[seen > 0]
@@ -513,18 +513,18 @@ def render_image(
         mounted = replace(mounted, shutter=Shutter(readout=optics.readout))
     motion = np.zeros(6) if motion is None else motion
     cam_from_world = mounted.cam_from_rig @ rig_from_world
-    smear = smeared(motion, rig_from_world, optics.smear_mm) if optics.smear_mm > 0 else None
+    smear = limit_motion(motion, rig_from_world, optics.smear_mm) if optics.smear_mm > 0 else None
     if not mounted.shutter.is_plain:
         light = _row_by_row(scene, mounted, frame.lighting, rig_from_world, motion, smear)
     else:
         lights = lamps(scene.handpiece, frame.lighting, rig_from_world)
-        below = scene.below(frame.lighting, rig_from_world)
+        below = scene.light_from_below(frame.lighting, rig_from_world)
         light = radiance(scene, mounted.camera, cam_from_world, lights, below, smear)
     if optics.aperture_mm > 0:
         depth_mm = np.nan_to_num(render_depth(scene.jaw.mesh, mounted.camera, cam_from_world), nan=np.inf)
         light = through_lens(light, depth_mm, mounted.camera, scene.handpiece.working_distance_mm, optics)
     rng = image_rng(scene, frame.name, camera_name)
-    return recorded(record(mixed(light, optics), gain, scene.handpiece, camera_name, rng), optics)
+    return encode_image(record(mix_channels(light, optics), gain, scene.handpiece, camera_name, rng), optics)
 
 
 def image_rng(scene: Scene, frame: str, camera_name: str) -> np.random.Generator:
@@ -599,7 +599,7 @@ def render_capture(
     if processes == 1:
         yield from map(worker, tasks)
         return
-    given = worker if workers.START_METHOD == "fork" else packed(worker)
+    given = worker if workers.START_METHOD == "fork" else pickle_fields(worker)
     with ProcessPoolExecutor(processes, get_context(workers.START_METHOD), _adopt, (given,)) as pool:
         for done in as_completed([pool.submit(_work, task) for task in tasks]):
             yield done.result()

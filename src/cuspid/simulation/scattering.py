@@ -40,7 +40,7 @@ class Scattering:
         return np.maximum(np.stack(spread, axis=-1), 0.0)
 
 
-def diffused(mesh: Mesh, length_mm: float, values: Float[np.ndarray, "v k"]) -> Float[np.ndarray, "v k"]:
+def diffuse(mesh: Mesh, length_mm: float, values: Float[np.ndarray, "v k"]) -> Float[np.ndarray, "v k"]:
     """Values per vertex after they have spread along the surface by a length."""
     spread = _Spread(mesh, np.full(len(mesh.faces), length_mm))
     return np.stack([spread(column) for column in values.T], axis=-1)

@@ -24,5 +24,5 @@ def record(
     """The image that a camera of a handpiece records, including its own gain and the falloff of its lens."""
     sensor, camera = handpiece.sensor_of(name), handpiece.rig[name].camera
     if sensor.gain != 1 or any(sensor.falloff):
-        radiance = radiance * sensor.transmitted(camera, camera.pixel_centres())[..., None]
+        radiance = radiance * sensor.relative_response(camera, camera.pixel_centres())[..., None]
     return expose(radiance, gain, sensor, rng)

@@ -76,7 +76,7 @@ class Illumination(NamedTuple):
     """What comes from all directions."""
 
 
-def illuminated(
+def illuminate(
     mesh: Mesh,
     surface: ShadedMesh,
     rays: Rays,

@@ -23,8 +23,8 @@ from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import usable_cores
 from cuspid.simulation.appearance import APPEARANCES, Preset
 from cuspid.simulation.blender import check_blender, render_with_blender
-from cuspid.simulation.lights import lit
-from cuspid.simulation.manufacturing import ManufacturingOptions, built, told
+from cuspid.simulation.lights import with_default_lights
+from cuspid.simulation.manufacturing import ManufacturingOptions, sample_built, with_tolerances
 from cuspid.simulation.optics import OpticsOptions, with_shutters
 from cuspid.simulation.path.scan import ScanPath, ScanPathOptions, plan_scan_path
 from cuspid.simulation.raycast import Scene, lit_frames, render_capture
@@ -74,13 +74,13 @@ def simulate(
 ) -> tuple[Capture, GroundTruth]:
     """Scan a jaw: images to ``folder/capture``, what only the simulator knows to ``folder/truth``.
 
-    A handpiece without lights is given one beside each camera (:func:`cuspid.simulation.lights.lit`). If it is not
-    built as it was drawn, the capture has the drawn one with its tolerances, and the truth the built one. Existing
-    images are kept; a run that is resumed gives the same bits as one that was not interrupted.
+    A handpiece without lights is given one beside each camera (:mod:`cuspid.simulation.lights`). If it is not built as
+    it was drawn, the capture has the drawn one with its tolerances, and the truth the built one. Existing images are
+    kept; a run that is resumed gives the same bits as one that was not interrupted.
     """
     folder = Path(folder)
-    handpiece = with_shutters(lit(handpiece), options.optics)
-    true, known = built(handpiece, options.manufacturing), told(handpiece, options.manufacturing)
+    handpiece = with_shutters(with_default_lights(handpiece), options.optics)
+    true, known = sample_built(handpiece, options.manufacturing), with_tolerances(handpiece, options.manufacturing)
     _check(true, options)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
     overlaps = path.min_overlap, path.mean_overlap
@@ -112,7 +112,7 @@ def take_images(
     default the true one, as exact. ``less``: what takes less time, for those who are told that it takes long."""
     if options.optics.scattering and not any(APPEARANCES[options.texture].enamel.scattering_mm):
         _LOG.info(f"optics: --scattering changes nothing, for light does not go below the texture {options.texture}")
-    handpiece = with_shutters(lit(handpiece), options.optics)
+    handpiece = with_shutters(with_default_lights(handpiece), options.optics)
     _check(handpiece, options)
     frames, poses = lit_frames(handpiece, rig_from_world)
     truth = GroundTruth(jaw=jaw, handpiece=handpiece, rig_from_world=poses)
@@ -128,7 +128,7 @@ def take_images(
 def _check(handpiece: Handpiece, options: RenderOptions) -> None:
     """Refuse what cannot be rendered before anything is written."""
     if options.renderer == "blender":
-        check_blender(handpiece, APPEARANCES[options.texture], options.optics.settled)
+        check_blender(handpiece, APPEARANCES[options.texture], options.optics.resolved)
 
 
 def _render(folder: Path, capture: Capture, truth: GroundTruth, options: RenderOptions) -> Iterator[tuple[int, int]]:
@@ -213,5 +213,5 @@ def scene_of(truth: GroundTruth, options: RenderOptions) -> Scene:
         appearance=APPEARANCES[options.texture].seen_by(truth.handpiece.footprint_mm),
         supersampling=options.supersampling,
         seed=options.seed,
-        optics=options.optics.settled,
+        optics=options.optics.resolved,
     )

@@ -80,7 +80,7 @@ class Compensation:
     reference: float
     """Falloff that is left as it is."""
 
-    def of(self, index: int, falloff: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    def log_gain(self, index: int, falloff: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Logarithm of what is divided out of a frame."""
         return np.asarray(self.gains[index] + self.exponent * (falloff - self.reference), dtype=np.float32)
 

@@ -168,7 +168,7 @@ class HeightMap:
         inside = ((place >= 0) & (place <= [columns, rows])).all(axis=-1)
         return np.asarray(inside & cells[place[..., 1].clip(0, rows), place[..., 0].clip(0, columns)])
 
-    def at(self, xy: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w"]:
+    def interpolate(self, xy: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w"]:
         """Heights at a grid of places, bilinear; that of the border beyond it."""
         place = ((xy - self.corner) / self.cell_mm).astype(np.float32)
         return np.asarray(
@@ -192,7 +192,7 @@ def in_occlusal_frame(model: SparseModel, scale: ScaleOptions | None) -> SparseM
     world_from_model = _level_rotation(world_from_model.apply(points)) @ world_from_model
     above = world_from_model.apply(centres)
     front = _facing_front(above[: frames_there(above[:, :2])], world_from_model.apply(points))
-    found = transformed(near, front @ world_from_model)
+    found = transform_model(near, front @ world_from_model)
     return found.scaled(1 / nearer if scale is None else scale_factor(found, scale))
 
 
@@ -212,7 +212,7 @@ def _width(points: Float[np.ndarray, "p 3"]) -> float:
     return float(np.diff(np.percentile(teeth[:, 0], [0.2, 99.8]))[0])
 
 
-def transformed(model: SparseModel, new_from_world: Rigid3) -> SparseModel:
+def transform_model(model: SparseModel, new_from_world: Rigid3) -> SparseModel:
     """The same motion in another world."""
     world_from_new = new_from_world.inverse()
     tracks = model.tracks
@@ -324,7 +324,7 @@ def height_map(model: SparseModel, options: HeightMapOptions) -> HeightMap:
     return HeightMap(corner=low, cell_mm=options.cell_mm, heights=heights, known=np.ones(heights.shape, bool))
 
 
-def uncovered(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> HeightMap:
+def lower_false_rises(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> HeightMap:
     """A dense surface whose false rises do not occlude what the camera went over.
 
     Where seen surface lies all around a place of a crown that is occluded in every frame, something rises beside it
@@ -338,7 +338,7 @@ def uncovered(dense: HeightMap, sparse: HeightMap, motion: SparseModel) -> Heigh
         part = tuple(slice(at.min(initial=max(cells)), at.max(initial=-1) + 1) for at in np.nonzero(inside & ~seen))
         seen[part] |= inside[part] & ~dense.occludes(places[part], pose.inverse().translation)
     holes = remove_small_holes(seen, max_size=round(HOLE_MM2 / dense.cell_mm**2)) & ~seen
-    crown = dense.heights > np.maximum(sparse.at(places[..., :2]) - _CROWN_MM, -_HOLLOW_MM)
+    crown = dense.heights > np.maximum(sparse.interpolate(places[..., :2]) - _CROWN_MM, -_HOLLOW_MM)
     wide = cv2.dilate(holes.astype(np.uint8), _disc(_RIM_MM, dense.cell_mm)) > 0
     return replace(dense, visible=wide & crown)
 

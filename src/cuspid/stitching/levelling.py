@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.geometry import Rigid3
-from cuspid.model.occlusal_plane import levelled
+from cuspid.model.occlusal_plane import level_crowns
 from cuspid.stitching.height_map import AXES_SD_DEG, HeightMap
 
 _STEPS = 8
@@ -20,14 +20,14 @@ def level_by_crowns(surface: HeightMap) -> Rigid3:
     The rule is that of :mod:`cuspid.model.occlusal_plane`, by which a mesh gets its occlusal frame, too.
     """
 
-    def seen(turn: Rigid3) -> Float[np.ndarray, "r c 3"]:
-        there = turned(surface, turn)
+    def surface_after(turn: Rigid3) -> Float[np.ndarray, "r c 3"]:
+        there = tilt_surface(surface, turn)
         return np.where(there.known[..., None], there.places, np.nan)
 
-    return levelled(seen, surface.cell_mm, AXES_SD_DEG)
+    return level_crowns(surface_after, surface.cell_mm, AXES_SD_DEG)
 
 
-def turned(surface: HeightMap, new_from_world: Rigid3) -> HeightMap:
+def tilt_surface(surface: HeightMap, new_from_world: Rigid3) -> HeightMap:
     """The surface over another plane, tilted by a few degrees against its own."""
     rows, columns = surface.heights.shape
     world_from_new, cell = new_from_world.inverse(), surface.cell_mm
@@ -38,6 +38,6 @@ def turned(surface: HeightMap, new_from_world: Rigid3) -> HeightMap:
     places = np.stack([x, y, np.zeros(x.shape)], axis=-1)
     for _ in range(_STEPS):
         there = world_from_new.apply(places)
-        places[..., 2] += surface.at(there[..., :2]) - there[..., 2]
+        places[..., 2] += surface.interpolate(there[..., :2]) - there[..., 2]
     known = surface.known_at(world_from_new.apply(places)[..., :2])
     return HeightMap(corner=low, cell_mm=cell, heights=places[..., 2].astype(np.float32), known=known)

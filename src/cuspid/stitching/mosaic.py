@@ -172,7 +172,7 @@ def positions(canvas: Canvas, view: PlacedFrame, surface: HeightMap, step: int) 
         view.top + step * (np.arange(rows) + 0.5),
     )
     xy = canvas.world(np.stack([u, v], axis=-1))
-    return np.concatenate([xy, surface.at(xy)[..., None]], axis=-1)
+    return np.concatenate([xy, surface.interpolate(xy)[..., None]], axis=-1)
 
 
 def frame_map(canvas: Canvas, view: PlacedFrame, surface: HeightMap) -> Float[np.ndarray, "h w 2"]:
@@ -468,6 +468,6 @@ def _split_bands(
     distance2 = np.sum(in_cam**2, axis=-1)
     falloff = np.log(np.maximum(in_cam[..., 2], 1e-6) / np.sqrt(distance2) / distance2).astype(np.float32)
     factor = cv2.resize(
-        np.exp(-compensation.of(index, falloff)), (view.width, view.height), interpolation=cv2.INTER_LINEAR
+        np.exp(-compensation.log_gain(index, falloff)), (view.width, view.height), interpolation=cv2.INTER_LINEAR
     )
     return _Layers.of(view.window, rectified * factor[..., None], valid, chosen.astype(np.float32), options.bands_px)

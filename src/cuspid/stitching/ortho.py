@@ -20,11 +20,11 @@ from cuspid.stitching.height_map import (
     ScaleOptions,
     height_map,
     in_occlusal_frame,
+    lower_false_rises,
     scale_factor,
-    transformed,
-    uncovered,
+    transform_model,
 )
-from cuspid.stitching.levelling import level_by_crowns, turned
+from cuspid.stitching.levelling import level_by_crowns, tilt_surface
 from cuspid.stitching.mosaic import Mosaic, MosaicOptions, compose
 from cuspid.stitching.plane_sweep import PlaneSweepOptions, plane_sweep
 from cuspid.stitching.strip import StripOptions, unroll
@@ -130,8 +130,8 @@ def orthophoto(
     motion, surface, dense, scale = shown
     if dense is not None:
         level = level_by_crowns(dense)
-        motion = transformed(motion, level)
-        surface = uncovered(turned(dense, level), height_map(motion, options.height_map), motion)
+        motion = transform_model(motion, level)
+        surface = lower_false_rises(tilt_surface(dense, level), height_map(motion, options.height_map), motion)
     mosaic = compose(motion, surface, read, options.mosaic, progress=progress)
     metric = scale is None or scale.working_distance_mm is not None or scale.width_mm is not None
     panorama = _panorama(mosaic, motion, frames, metric)
@@ -174,7 +174,7 @@ def _laid_onto(model: SparseModel, other: SparseModel, *, keeps_scale: bool) -> 
     scale, rotation, _ = best_similarity(seen, there)
     scale = 1.0 if keeps_scale else scale
     onto = Rigid3(rotation, there.mean(axis=0) - scale * rotation @ seen.mean(axis=0))
-    return transformed(model.scaled(scale), onto)
+    return transform_model(model.scaled(scale), onto)
 
 
 def _largest_shift(model: SparseModel, other: SparseModel) -> float:

@@ -131,7 +131,7 @@ class Grid(NamedTuple):
     rows: int
 
     @staticmethod
-    def over(motion: SparseModel, cell_mm: float) -> Grid:
+    def from_motion(motion: SparseModel, cell_mm: float) -> Grid:
         """About the points of a motion, a whole number of pools wide."""
         low, high = np.percentile(motion.tracks.points[:, :2], [0.2, 99.8], axis=0) + [[-4.0], [4.0]]
         columns, rows = (_POOL * np.ceil((high - low) / cell_mm / _POOL)).astype(int).tolist()
@@ -178,9 +178,9 @@ class _Ground(NamedTuple):
         """A surface, with the slopes that it has on average."""
         smooth = cv2.GaussianBlur(surface.heights, (0, 0), _SLOPE_MM / surface.cell_mm)
         slopes = np.gradient(smooth, surface.cell_mm)
-        down, across = (replace(surface, heights=slope).at(grid.centres) for slope in slopes)
+        down, across = (replace(surface, heights=slope).interpolate(grid.centres) for slope in slopes)
         normals = np.dstack([-across, -down, np.ones_like(down)]).astype(np.float64)
-        places = np.dstack([grid.centres, surface.at(grid.centres)])
+        places = np.dstack([grid.centres, surface.interpolate(grid.centres)])
         height = float(np.median(places[..., 2]))
         return _Ground(grid, places, normals / np.linalg.norm(normals, axis=-1, keepdims=True), height)
 
@@ -314,7 +314,7 @@ def _alike(one: Float32[np.ndarray, "h w"], other: Float32[np.ndarray, "h w"]) -
     return np.asarray(cv2.blur(np.clip(1 - np.abs(one - other) / _UNLIKE_DN, 0, 1) * lit, (_ALIKE_CELLS,) * 2))
 
 
-def _agreed(
+def _correlate(
     one: _Laid, a: tuple[slice, slice], other: _Laid, b: tuple[slice, slice], window: int, same_lights: bool
 ) -> Float32[np.ndarray, "h w"]:
     """What two images agree on parts of a surface, 0 to 1."""
@@ -335,7 +335,7 @@ def _add_agreement(
     a, b = one.part(low, high), other.part(low, high)
     weight = np.minimum(one.weight[a], other.weight[b])
     here = slice(low[1], high[1]), slice(low[0], high[0])
-    agreement[here] += weight * _agreed(one, a, other, b, window, same_lights)
+    agreement[here] += weight * _correlate(one, a, other, b, window, same_lights)
     pairs[here] += weight
 
 
@@ -396,8 +396,8 @@ def plane_sweep(
     camera = motion.camera
     pixel_mm = float(np.median(motion.depths) / np.mean(camera.focal_px))
     finest_mm = 0.5 * pixel_mm / compared.baseline_share
-    grid = Grid.over(motion, max(options.cell_mm, pixel_mm)) if start is None else Grid.of(start[0])
-    ceiling = sparse.at(grid.pooled.centres) + _ABOVE_MM
+    grid = Grid.from_motion(motion, max(options.cell_mm, pixel_mm)) if start is None else Grid.of(start[0])
+    ceiling = sparse.interpolate(grid.pooled.centres) + _ABOVE_MM
     step_mm = max(options.step_mm, finest_mm)
     sweep = partial(_swept, compared, _Pictures(compared, read, options.detail_px), ceiling, options)
     finer = [max(step_mm / parts, finest_mm) * np.arange(-copies, copies + 1) for parts, copies in _FINER]

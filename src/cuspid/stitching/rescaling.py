@@ -46,7 +46,7 @@ class Rescaled:
     """The measured distances, in the panorama as it is now."""
 
 
-def rescaled(panorama: Panorama, distances: Sequence[MeasuredDistance]) -> Rescaled:
+def rescale_panorama(panorama: Panorama, distances: Sequence[MeasuredDistance]) -> Rescaled:
     """The panorama at the scale that suits the distances best (least squares of their errors in mm).
 
     Raises InputError where a place is not shown, where the places of a distance are the same, and for a view of a mesh,

@@ -50,7 +50,7 @@ def arch_curve(motion: SparseModel, surface: HeightMap, options: StripOptions) -
     for _ in range(2):
         normals = sides_of(curve)
         places = curve[:, None] + across[:, None] * normals[:, None]
-        heights = surface.at(places)
+        heights = surface.interpolate(places)
         weight = np.clip(heights - (heights.max(axis=1, keepdims=True) - options.occlusal_mm), 0, None)
         middle = (weight * across).sum(axis=1) / weight.sum(axis=1)
         curve = even(smooth(curve + middle[:, None] * normals, options.smoothing_mm))
@@ -94,7 +94,7 @@ def unroll(
     image = cv2.remap(panorama.image, where, None, cv2.INTER_LINEAR)
     covered = cv2.remap(panorama.covered.astype(np.uint8), where, None, cv2.INTER_NEAREST) > 0
     image[~covered] = 0
-    zones = np.where(covered, zones_of(surface.at(places), half, options), -1).astype(np.int16)
+    zones = np.where(covered, zones_of(surface.interpolate(places), half, options), -1).astype(np.int16)
     shown = np.flatnonzero(covered[half])
     if not len(shown):
         return None

@@ -12,7 +12,7 @@ from cuspid.model.board import Board
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import read_text
 from cuspid.runtime.options import check
-from cuspid.runtime.values import number, shown, whole
+from cuspid.runtime.values import number, quote, whole
 from cuspid.storage.calibrations.documents import parse
 from cuspid.storage.files import reading
 
@@ -34,12 +34,12 @@ def read_boards(path: Path) -> tuple[Board, ...]:
 
 def _board(value: Any) -> Board:
     if not isinstance(value, Mapping):
-        raise InputError(f"a board is {shown(value)}; it must be Kalibr's target_type and so on, or options by name")
+        raise InputError(f"a board is {quote(value)}; it must be Kalibr's target_type and so on, or options by name")
     if "target_type" not in value:
         return _of_options(value)
     kind = value["target_type"]
     if kind not in _KALIBR:
-        raise InputError(f"target_type is {shown(kind)}; it must be one of {', '.join(_KALIBR)}")
+        raise InputError(f"target_type is {quote(kind)}; it must be one of {', '.join(_KALIBR)}")
     return _KALIBR[kind](value)
 
 
@@ -50,13 +50,13 @@ def _of_options(value: Mapping[str, Any]) -> Board:
     strange = [name for name in given if name not in known]
     if strange or not given:
         raise InputError(
-            f"{', '.join(map(shown, strange)) or 'nothing'} is no option of a board; these are {', '.join(known)}"
+            f"{', '.join(map(quote, strange)) or 'nothing'} is no option of a board; these are {', '.join(known)}"
         )
     if "square_mm" not in given:
         raise InputError("square_mm is missing: the side of a square in mm")
     for name, each in given.items():
         if name in _SWITCHES and not isinstance(each, bool):
-            raise InputError(f"{name} is {shown(each)}; it must be true or false")
+            raise InputError(f"{name} is {quote(each)}; it must be true or false")
         if name in _WHOLE:
             given[name] = whole(name, each, 0, 10**6)
         elif name not in (*_SWITCHES, *_WORDS):
@@ -94,7 +94,7 @@ def _checkerboard(value: Mapping[str, Any]) -> Board:
 def _circlegrid(value: Mapping[str, Any]) -> Board:
     shifted = value["asymmetricGrid"]
     if not isinstance(shifted, bool):
-        raise InputError(f"asymmetricGrid is {shown(shifted)}; it must be true or false")
+        raise InputError(f"asymmetricGrid is {quote(shifted)}; it must be true or false")
     return Board(
         kind="asymmetric-circles" if shifted else "circles",
         columns=_count(value, "targetCols"),

@@ -14,7 +14,7 @@ from cuspid.model.capture import Capture, Dropped, Frame, ImageFolder
 from cuspid.model.rig import Handpiece, Rig
 from cuspid.runtime.errors import InputError, OutputError
 from cuspid.runtime.workers import map_in_threads
-from cuspid.storage.files import as_declared, digest_of, finished, read_json, reading, write_bytes, write_json
+from cuspid.storage.files import as_declared, digest_of, list_finished, read_json, reading, write_bytes, write_json
 from cuspid.storage.handpieces import hash_handpiece, read_handpiece, write_handpiece, write_rig_config
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -74,11 +74,11 @@ def read_capture(
 
 def folders_of_images(images: Path) -> set[str]:
     """The folders in which images lie, at any depth, as cameras are named: ``left``, ``rig/left``."""
-    found, left = set[str](), [path for path in finished(images) if path.is_dir()]
+    found, left = set[str](), [path for path in list_finished(images) if path.is_dir()]
     while left:
         folder = left.pop()
-        inner = [path for path in finished(folder) if path.is_dir()]
-        if not inner or any(path.suffix.lower() in IMAGE_SUFFIXES for path in finished(folder)):
+        inner = [path for path in list_finished(folder) if path.is_dir()]
+        if not inner or any(path.suffix.lower() in IMAGE_SUFFIXES for path in list_finished(folder)):
             found.add(folder.relative_to(images).as_posix())
         left += inner
     return found
@@ -124,7 +124,7 @@ def _present(
 def _image_stems(images: Path, cameras: Sequence[str]) -> tuple[str, dict[str, set[str]]]:
     """Image suffix, and the stems of each camera's images."""
     files = {
-        camera: [path for path in finished(images / camera) if path.suffix.lower() in IMAGE_SUFFIXES]
+        camera: [path for path in list_finished(images / camera) if path.suffix.lower() in IMAGE_SUFFIXES]
         for camera in cameras
         if (images / camera).is_dir()
     }

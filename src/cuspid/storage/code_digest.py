@@ -49,13 +49,13 @@ def _imports(text: bytes) -> frozenset[tuple[str, str]]:
     found = set[tuple[str, str]]()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import | ast.ImportFrom):
-            found |= {_taken(node, alias) for alias in node.names}
+            found |= {_imported_name(node, alias) for alias in node.names}
         elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == PACKAGE:
             found.add((PACKAGE, node.attr))
     return frozenset(found)
 
 
-def _taken(statement: ast.Import | ast.ImportFrom, alias: ast.alias) -> tuple[str, str]:
+def _imported_name(statement: ast.Import | ast.ImportFrom, alias: ast.alias) -> tuple[str, str]:
     if isinstance(statement, ast.Import):
         return alias.name, ""
     if statement.level:
@@ -77,7 +77,7 @@ class Code:
             return module
         if module not in self._digests:
             self._digests[module] = module  # where imports go round in a circle
-            self._digests[module] = self._digested(self._needed(module))
+            self._digests[module] = self._digest(self._read_source(module))
         return self._digests[module]
 
     def modules(self, roots: Iterable[str]) -> frozenset[str]:
@@ -87,7 +87,7 @@ class Code:
             module = waiting.pop()
             if module not in found and not self._is_left_out(module):
                 found.add(module)
-                named = (self._source(*each) for each in _imports(self._needed(module)))
+                named = (self._source(*each) for each in _imports(self._read_source(module)))
                 waiting += [each[0] for each in named if each is not None and each[0]]
         return frozenset(found)
 
@@ -99,13 +99,13 @@ class Code:
             self._texts[module] = self._read(module)
         return self._texts[module]
 
-    def _needed(self, module: str) -> bytes:
+    def _read_source(self, module: str) -> bytes:
         text = self._text(module)
         if text is None:
             raise LookupError(f"there is no module {module}")
         return text
 
-    def _digested(self, text: bytes) -> str:
+    def _digest(self, text: bytes) -> str:
         tree = _statements(text)
         for body in [*_bodies(tree)]:
             brought: list[tuple[str, str, str]] = []
@@ -120,7 +120,7 @@ class Code:
             return statement
         foreign = []
         for alias in statement.names:
-            taken = _taken(statement, alias)
+            taken = _imported_name(statement, alias)
             if self._source(*taken) is None:
                 foreign.append(alias)
             else:

@@ -25,7 +25,7 @@ from jaxtyping import jaxtyped
 import cuspid
 from cuspid.runtime.errors import CuspidError, InputError, OutputError
 from cuspid.runtime.inputs import LARGEST_MIB, read_text, require_file
-from cuspid.runtime.values import one_line, shown
+from cuspid.runtime.values import one_line, quote
 
 _Made = TypeVar("_Made")
 _UNUSABLE = (ValueError, TypeError, AttributeError, IndexError, OverflowError, csv.Error, np.linalg.LinAlgError)
@@ -38,7 +38,7 @@ _NOT_FOR_US = ("@eaDir", "__MACOSX", "Thumbs.db", "desktop.ini", "lost+found")
 """What systems put beside files, without a dot."""
 
 
-def finished(folder: Path) -> list[Path]:
+def list_finished(folder: Path) -> list[Path]:
     """What is in a folder, without the unfinished files of a killed run and what is hidden, as systems put it beside
     the files of people. Raises InputError where the folder may not be entered."""
     try:
@@ -272,7 +272,7 @@ def claim_folder(
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; give a folder as --out")
     manifest = read_manifest(folder)
-    if not manifest and folder.exists() and finished(folder):
+    if not manifest and folder.exists() and list_finished(folder):
         raise OutputError(f"{folder}: holds files that are not from cuspid; give an empty or new folder as --out")
     if stage in manifest and manifest[stage] != entry and not replace:
         changed = _first_difference(manifest[stage], entry)
@@ -375,7 +375,7 @@ def as_declared(kind: Callable[..., _Made], /, **values: Any) -> _Made:
         if name not in hints:
             raise InputError(f"unknown field '{name}'; see docs/formats.md")
         if not _fits(value, hints[name]):
-            found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else shown(value)
+            found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else quote(value)
             raise InputError(f"the field '{name}' cannot be {found}; see docs/formats.md")
         if isinstance(value, int) and float in (hints[name], *get_args(hints[name])):
             values[name] = float(value)

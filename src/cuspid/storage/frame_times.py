@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import read_text
-from cuspid.runtime.values import number, shown
+from cuspid.runtime.values import number, quote
 from cuspid.storage.files import reading
 
 TIMES_FILES = ("times.csv", "timestamps.csv")
@@ -38,7 +38,7 @@ def read_frame_times(path: Path, cameras: Sequence[str]) -> dict[str, dict[str, 
             called, frame, time = ((row[columns[each]] or "").strip() for each in _COLUMNS)
             times = found[_camera(called, cameras)]
             if frame in times:
-                raise InputError(f"line {line}: frame {shown(frame)} of {called} is listed twice")
+                raise InputError(f"line {line}: frame {quote(frame)} of {called} is listed twice")
             times[frame] = number(f"line {line}: time", float(time), -_LONGEST_S, _LONGEST_S)
     return found
 
@@ -46,7 +46,7 @@ def read_frame_times(path: Path, cameras: Sequence[str]) -> dict[str, dict[str, 
 def _column(names: Sequence[str], meaning: str) -> str:
     fitting = [name for name in names if name and name.strip().lower() in _COLUMNS[meaning]]
     if len(fitting) != 1:
-        raise InputError(f"needs one column '{meaning}' (or {', '.join(_COLUMNS[meaning][1:])}); it has {shown(names)}")
+        raise InputError(f"needs one column '{meaning}' (or {', '.join(_COLUMNS[meaning][1:])}); it has {quote(names)}")
     return fitting[0]
 
 
@@ -54,5 +54,5 @@ def _camera(called: str, cameras: Sequence[str]) -> str:
     ending = re.compile(rf"(.*\D)?0*{re.escape(called)}")
     fitting = [called] if called in cameras else [name for name in cameras if called and ending.fullmatch(name)]
     if len(fitting) != 1:
-        raise InputError(f"unknown camera {shown(called)}; the cameras are {', '.join(cameras)}")
+        raise InputError(f"unknown camera {quote(called)}; the cameras are {', '.join(cameras)}")
     return fitting[0]

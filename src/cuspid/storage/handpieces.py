@@ -19,7 +19,17 @@ from cuspid.model.pairing import guess_working_distance_mm
 from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig, Sensor, depth_of_field_mm
 from cuspid.model.shutter import Shutter
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import LONGEST_MM, MOST_PX, checked_name, covariance, number, numbers, shown, title, whole
+from cuspid.runtime.values import (
+    LONGEST_MM,
+    MOST_PX,
+    checked_name,
+    covariance,
+    number,
+    numbers,
+    quote,
+    title,
+    whole,
+)
 from cuspid.storage.files import digest_of, read_json, reading, write_json
 
 _MOST_DISTORTION = 1e3
@@ -43,7 +53,7 @@ def rigid_from_json(value: Mapping[str, Any], what: str = "pose") -> Rigid3:
     """Inverse of :func:`rigid_to_json`. Raises InputError for what is no rigid motion."""
     quaternion = numbers(f"{what}: rotation_wxyz", value["rotation_wxyz"], (4,), -LONGEST_MM, LONGEST_MM)
     if not np.linalg.norm(quaternion) > _SHORTEST_QUATERNION:
-        raise InputError(f"{what}: rotation_wxyz is {shown(value['rotation_wxyz'])}; it must not be all zeros")
+        raise InputError(f"{what}: rotation_wxyz is {quote(value['rotation_wxyz'])}; it must not be all zeros")
     translation = numbers(f"{what}: translation_mm", value["translation_mm"], (3,), -LONGEST_MM, LONGEST_MM)
     return Rigid3.from_quaternion(quaternion, translation)
 
@@ -96,7 +106,7 @@ def _camera_of_model(value: Mapping[str, Any], width: int, height: int, what: st
     """A camera whose model is named."""
     name = value["model"]
     if name not in MODELS:
-        raise InputError(f"{what}: model {shown(name)} is not supported; use one of {', '.join(MODELS)}")
+        raise InputError(f"{what}: model {quote(name)} is not supported; use one of {', '.join(MODELS)}")
     also = [key for key in ("focal_px", "principal_point_px", "distortion_k1_k2_p1_p2") if key in value]
     if also:
         raise InputError(f"{what}: it has both model and {also[0]}; give the parameters of {name} in params alone")
@@ -221,10 +231,10 @@ def write_handpiece(path: Path | str, handpiece: Handpiece) -> None:
 def _light_from_json(value: Mapping[str, Any], what: str) -> Light:
     strange = sorted(set(value) - {*_LIGHT_FIELDS, _LIGHT_COVARIANCE})
     if strange:
-        raise InputError(f"{what}: unknown field {shown(strange[0])}; see docs/formats.md")
+        raise InputError(f"{what}: unknown field {quote(strange[0])}; see docs/formats.md")
     direction = numbers(f"{what}: direction", value["direction"], (3,), -LONGEST_MM, LONGEST_MM)
     if not np.linalg.norm(direction) > _SHORTEST_DIRECTION:
-        raise InputError(f"{what}: direction is {shown(value['direction'])}; its length must exceed 1e-6")
+        raise InputError(f"{what}: direction is {quote(value['direction'])}; its length must exceed 1e-6")
     matrix = value.get(_LIGHT_COVARIANCE)
     return Light(
         position_mm=numbers(f"{what}: position_mm", value["position_mm"], (3,), -LONGEST_MM, LONGEST_MM),
@@ -241,7 +251,7 @@ def _sensor_from_json(value: Mapping[str, Any], what: str) -> Sensor:
     known = [*_SENSOR_RANGES, "falloff_r2_r4", _SENSOR_COVARIANCE]
     strange = sorted(set(value) - set(known))
     if strange:
-        raise InputError(f"{what}: unknown field {shown(strange[0])}; choose from {', '.join(known)}")
+        raise InputError(f"{what}: unknown field {quote(strange[0])}; choose from {', '.join(known)}")
     plain = {key: number(f"{what}: {key}", value[key], *_SENSOR_RANGES[key]) for key in _SENSOR_RANGES if key in value}
     falloff = value.get("falloff_r2_r4", (0.0, 0.0))
     a, b = numbers(f"{what}: falloff_r2_r4", falloff, (2,), -_STEEPEST_FALLOFF, _STEEPEST_FALLOFF).tolist()
@@ -287,7 +297,7 @@ def read_handpiece(path: Path | str, working_distance_mm: float | None = None) -
         return Handpiece(
             rig=rig,
             lights={
-                checked_name(f"{path}: lights", key): _light_from_json(light, f"{path}: light {shown(key)}")
+                checked_name(f"{path}: lights", key): _light_from_json(light, f"{path}: light {quote(key)}")
                 for key, light in value.get("lights", {}).items()
             },
             lightings=tuple(
@@ -296,7 +306,7 @@ def read_handpiece(path: Path | str, working_distance_mm: float | None = None) -
             ),
             sensor=_sensor_from_json(value.get("sensor", {}), f"{path}: sensor"),
             sensors={
-                checked_name(f"{path}: sensors", key): _sensor_from_json(sensor, f"{path}: sensor {shown(key)}")
+                checked_name(f"{path}: sensors", key): _sensor_from_json(sensor, f"{path}: sensor {quote(key)}")
                 for key, sensor in value.get("sensors", {}).items()
             },
             working_distance_mm=distance_mm,
@@ -310,10 +320,10 @@ def rig_from_handpiece(value: Mapping[str, Any], where: str = "") -> Rig:
     """The cameras of ``handpiece.json``. Raises InputError that begins with ``where``."""
     strange = sorted(set(value) - _FIELDS)
     if strange:
-        raise InputError(f"{where}unknown field {shown(strange[0])}; choose from {', '.join(sorted(_FIELDS))}")
+        raise InputError(f"{where}unknown field {quote(strange[0])}; choose from {', '.join(sorted(_FIELDS))}")
     return Rig(
         {
-            checked_name(f"{where}cameras", key): _mounted_from_json(camera, f"{where}camera {shown(key)}")
+            checked_name(f"{where}cameras", key): _mounted_from_json(camera, f"{where}camera {quote(key)}")
             for key, camera in value["cameras"].items()
         }
     )
@@ -333,7 +343,7 @@ def _box_from_json(where: str, value: Any) -> Box:
         raise InputError(f"{where}: box_from_rig must have exactly the fields rotation_wxyz and translation_mm")
     size = numbers(f"{where}: size_mm", value["size_mm"], (3,), 0.0, LONGEST_MM)
     if not size.all():
-        raise InputError(f"{where}: size_mm is {shown(value['size_mm'])}; it must be three positive lengths")
+        raise InputError(f"{where}: size_mm is {quote(value['size_mm'])}; it must be three positive lengths")
     return Box(rigid_from_json(pose, f"{where}: box_from_rig"), size / 2)
 
 
@@ -409,7 +419,7 @@ def rig_from_config(value: Any, image_size_px: tuple[int, int] | None = None) ->
     cameras: dict[str, MountedCamera] = {}
     for entry in value[0]["cameras"]:
         key = checked_name("image_prefix", str(entry["image_prefix"]).rstrip("/"))
-        what = f"camera {shown(key)}"
+        what = f"camera {quote(key)}"
         cam_from_rig = Rigid3.identity() if entry.get("ref_sensor") else _place_in_rig(entry, what)
         cameras[key] = MountedCamera(camera_from_colmap(entry, image_size_px, what), cam_from_rig)
     return Rig(cameras)
@@ -441,7 +451,7 @@ def camera_from_colmap(entry: Mapping[str, Any], image_size_px: tuple[int, int] 
     model = entry["camera_model_name"]
     if model not in _COLMAP_PARAMETERS and model not in MODELS:
         known = ", ".join([*_COLMAP_PARAMETERS, *MODELS])
-        raise InputError(f"{what}: model {shown(model)} is not supported; use one of {known}")
+        raise InputError(f"{what}: model {quote(model)} is not supported; use one of {known}")
     parameters = np.array(entry["camera_params"], dtype=np.float64)
     if model in _COLMAP_PARAMETERS:
         chosen = parameters[list(_COLMAP_PARAMETERS[model])]

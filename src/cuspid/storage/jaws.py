@@ -12,7 +12,7 @@ from cuspid.model.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch, Jaw, Landmar
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import is_there, require_file
-from cuspid.runtime.values import LONGEST_MM, number, numbers, one_line, shown, whole
+from cuspid.runtime.values import LONGEST_MM, number, numbers, one_line, quote, whole
 from cuspid.storage.files import read_json, reading, write_json
 from cuspid.storage.meshes import MESH_SUFFIXES, MeshFile, read_mesh_file, write_mesh
 from cuspid.storage.units import Unit
@@ -117,7 +117,7 @@ def read_jaw(path: Path) -> Jaw:
     with reading(beside):
         arch: Arch | None = extra["arch"]
         if arch not in (*ARCHES, None):
-            raise ValueError(f"arch is {shown(arch)}")
+            raise ValueError(f"arch is {quote(arch)}")
         return Jaw(
             mesh=mesh,
             face_labels=labels,

@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from cuspid.model.jaw import Landmark
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 from cuspid.storage.files import read_json, write_json
 
 LandmarkFrame = Literal["occlusal", "mesh"]
@@ -177,13 +177,13 @@ def _parse_label(value: Any, name: str, path: Path) -> Iterable[tuple[str, Mappi
 
 def _one_of(value: Any, allowed: tuple[Any, ...], name: str, path: Path) -> Any:
     if not isinstance(value, str) or value not in allowed:
-        raise InputError(f"{path}: '{name}' is {shown(value)}; it must be {' or '.join(allowed)}")
+        raise InputError(f"{path}: '{name}' is {quote(value)}; it must be {' or '.join(allowed)}")
     return value
 
 
 def _position(value: Any, label: str, path: Path) -> Float[np.ndarray, "3"]:
     if not isinstance(value, list) or len(value) != 3 or not all(_is_finite(number) for number in value):
-        raise InputError(f"{path}: the position of landmark '{label}' must be three finite numbers, not {shown(value)}")
+        raise InputError(f"{path}: the position of landmark '{label}' must be three finite numbers, not {quote(value)}")
     return np.array(value, dtype=np.float64)
 
 
@@ -191,7 +191,7 @@ def _sigma(value: Any, label: str, path: Path) -> float | None:
     if value is None or (_is_finite(value) and value >= 0):
         return None if value is None else float(value)
     raise InputError(
-        f"{path}: estimated_sigma_mm of landmark '{label}' must be a number of at least 0, not {shown(value)}"
+        f"{path}: estimated_sigma_mm of landmark '{label}' must be a number of at least 0, not {quote(value)}"
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 
-from cuspid.geometry import distinct_rows, owned
+from cuspid.geometry import distinct_rows, freeze
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import read_bytes, require_file
@@ -124,8 +124,8 @@ def _check_mesh(path: Path, loaded: trimesh.Trimesh, declared: int, unit: Unit) 
         raise InputError(f"{path}: faces refer to vertices that do not exist; export the mesh again")
     first, number = distinct_rows(vertices)
     colors = _colors(loaded, "vertex")
-    merged = owned(vertices[first] * mm_per_unit)
-    mesh = Mesh(merged, owned(number[faces]), None if colors is None else owned(colors[first]))
+    merged = freeze(vertices[first] * mm_per_unit)
+    mesh = Mesh(merged, freeze(number[faces]), None if colors is None else freeze(colors[first]))
     if not mesh.face_areas.sum() > _LEAST_AREA * np.ptp(mesh.bounds, axis=0).max() ** 2:
         raise InputError(f"{path}: its triangles have no area; export the surface again")
     values = _ply_values(loaded, "vertex")

@@ -16,7 +16,7 @@ from cuspid.runtime.errors import InputError
 from cuspid.runtime.image_files import exif_orientation, image_size
 from cuspid.runtime.progress import Progress, silent
 from cuspid.storage.captures import IMAGE_SUFFIXES
-from cuspid.storage.files import digest_of, finished
+from cuspid.storage.files import digest_of, list_finished
 from cuspid.storage.handpieces import read_handpiece
 from cuspid.storage.sequences import LEAST_PX, images_in, read_sequence
 from cuspid.storage.videos import VIDEO_SUFFIXES
@@ -37,7 +37,7 @@ def is_photographs(source: Path, handpiece: Path | None = None) -> bool:
     if not images.is_dir():
         return bool(images_in(source)) or bool(_not_readable(source))
     known = handpiece or source / "handpiece.json"
-    if any(path.is_dir() for path in finished(images)):
+    if any(path.is_dir() for path in list_finished(images)):
         return known.is_file() and len(read_handpiece(known).rig.names) == 1
     return True
 
@@ -94,13 +94,13 @@ def _home(source: Path) -> Path:
     images = source / "images"
     if not images.is_dir():
         return source
-    inner = sorted(path for path in finished(images) if path.is_dir())
+    inner = sorted(path for path in list_finished(images) if path.is_dir())
     return inner[0] if inner and not images_in(images) else images
 
 
 def _not_readable(folder: Path) -> list[str]:
     """A note where there are photographs of a kind that is not read."""
-    strange = [path for path in finished(folder) if path.suffix.lower() in _UNREADABLE]
+    strange = [path for path in list_finished(folder) if path.suffix.lower() in _UNREADABLE]
     if not strange:
         return []
     kinds = ", ".join(IMAGE_SUFFIXES)
@@ -146,7 +146,7 @@ def _by_camera(
 ) -> tuple[tuple[Photograph, ...], dict[str, PhotoCamera]]:
     """Photographs, and the cameras that took them: one for each size and focal length."""
     told = {path: _Exif.of(path) for path in sizes}
-    stored = {path: told[path].stored(size) for path, size in sizes.items()}
+    stored = {path: told[path].sensor_size(size) for path, size in sizes.items()}
     kinds = {path: (stored[path], *told[path].lens) for path in sizes}
     order = list(dict.fromkeys(kinds.values()))
     names = [_ONE] if len(order) == 1 else [f"{_ONE}-{n + 1}" for n in range(len(order))]
@@ -218,7 +218,7 @@ class _Exif:
             return _Exif()
         return _Exif(orientation if orientation in range(1, 9) else UPRIGHT, lens)
 
-    def stored(self, upright: tuple[int, int]) -> tuple[int, int]:
+    def sensor_size(self, upright: tuple[int, int]) -> tuple[int, int]:
         """Size in the grid of the sensor."""
         return upright[::-1] if self.orientation >= 5 else upright
 

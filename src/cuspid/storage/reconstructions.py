@@ -13,7 +13,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.capture import Dropped
 from cuspid.model.reconstruction import DepthMap, Expectation, Funnel, Reconstruction, Refinement, SurfacePoints, Tracks
 from cuspid.model.rig import Handpiece
-from cuspid.runtime.values import checked_name, shown
+from cuspid.runtime.values import checked_name, quote
 from cuspid.storage.files import as_declared, read_arrays, read_json, reading, to_plain, write_arrays, write_json
 from cuspid.storage.handpieces import (
     camera_from_json,
@@ -35,7 +35,7 @@ def read_poses(path: Path) -> dict[str, Rigid3]:
     value = read_json(path)
     with reading(path):
         return {
-            checked_name(f"{path}: frames", key): rigid_from_json(pose, f"{path}: frame {shown(key)}")
+            checked_name(f"{path}: frames", key): rigid_from_json(pose, f"{path}: frame {quote(key)}")
             for key, pose in value.items()
         }
 

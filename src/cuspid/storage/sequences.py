@@ -17,15 +17,18 @@ from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.values import checked_name
 from cuspid.storage.calibrations import MOST_LOST_PX, read_calibration
 from cuspid.storage.captures import IMAGE_SUFFIXES, read_capture, write_image
-from cuspid.storage.files import digest_of, finished, hash_file, read_json
+from cuspid.storage.files import digest_of, hash_file, list_finished, read_json
 from cuspid.storage.handpieces import read_handpiece
-from cuspid.storage.videos import VIDEO_SUFFIXES, read_video, video_length
+from cuspid.storage.videos import VIDEO_SUFFIXES, read_video, video_length, video_rate
 
 LEAST_PX = 32
 """Side of a frame that shows something."""
 MOST_FRAMES = 300
 """A longer video is thinned evenly to about as many frames."""
 
+_UNUSED_SHUTTER = (
+    "shutter: the readout of the handpiece's file is not taken into account: one camera alone is located without it"
+)
 _NUMBERS = re.compile(r"(\D*)(\d*)")
 
 
@@ -74,7 +77,7 @@ def rig_sources(folder: Path) -> dict[str, Path]:
     home = folder / "images" if (folder / "images").is_dir() else folder
     if not home.is_dir():
         raise InputError(f"{folder}: no such folder")
-    sources = sorted(path for path in finished(home) if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES)
+    sources = sorted(path for path in list_finished(home) if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES)
     if not sources:
         raise InputError(f"{home}: it contains no folder of images and no video; each camera needs one")
     named = {checked_name(f"{home}: cameras", path.name if path.is_dir() else path.stem): path for path in sources}
@@ -92,7 +95,7 @@ def hash_source(source: Path) -> str:
 
 def images_in(folder: Path) -> list[Path]:
     """The images of a folder, in the order of the numbers in their names."""
-    images = [path for path in finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in list_finished(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
     return sorted(images, key=lambda path: name_order(path.name))
 
 
@@ -171,7 +174,10 @@ def _of_video(video: Path, decoded: Path, progress: Progress) -> ImageSequence:
         notes.append(f"{video.name}: {missing}")
     if step > 1:
         notes.append(f"{video.name}: {number} frames; one in every {step} is used")
-    return ImageSequence(source=video, paths=tuple(paths), size=_common_size(decoded, paths), notes=tuple(notes))
+    size = _common_size(decoded, paths)
+    return ImageSequence(
+        source=video, paths=tuple(paths), size=size, frames_per_s=video_rate(video), notes=tuple(notes)
+    )
 
 
 # --- calibration ---------------------------------------------------------------------------------------------------
@@ -192,7 +198,9 @@ def _with_calibration(sequence: ImageSequence, path: Path) -> ImageSequence:
 
 def _with_handpiece(sequence: ImageSequence, handpiece: Handpiece, path: Path) -> ImageSequence:
     found = _with_rig(sequence, handpiece.rig, path)
-    return replace(found, working_distance_mm=handpiece.working_distance_mm)
+    rolls = not all(each.shutter.is_plain for each in handpiece.rig.cameras.values())
+    notes = (*found.notes, _UNUSED_SHUTTER) if rolls else found.notes
+    return replace(found, working_distance_mm=handpiece.working_distance_mm, notes=notes)
 
 
 def _with_rig(sequence: ImageSequence, rig: Rig, path: Path) -> ImageSequence:

@@ -31,7 +31,7 @@ _log = logging.getLogger("cuspid")
 
 
 @cache
-def _installed() -> Code:
+def _installed_code() -> Code:
     """The modules of cuspid as they are installed."""
     root = Path(str(package_files(PACKAGE)))
 
@@ -49,7 +49,7 @@ def _installed() -> Code:
 @cache
 def code_version(*modules: str) -> str:
     """What some modules do, and those that they import: see :mod:`cuspid.storage.code_digest`."""
-    return digest_of([_installed().digest(module) for module in modules])
+    return digest_of([_installed_code().digest(module) for module in modules])
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,7 +116,9 @@ def read_video(path: Path) -> Iterator[VideoFrame]:
 def video_rate(path: Path) -> float | None:
     """Frames a second of a video, None where its header does not say. Raises InputError where it is no file."""
     with _open_video(path) as container:
-        rate = None if container is None else container.streams.video[0].average_rate
+        if container is None or container.format.name in _STREAMS.values():
+            return None
+        rate = container.streams.video[0].average_rate
         return float(rate) if rate else None
 
 

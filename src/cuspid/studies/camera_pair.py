@@ -237,7 +237,7 @@ def _evaluate(
     points, normals = pose.apply(mesh.face_centres[faces]), pose.rotate(mesh.face_normals[faces])
     figures = _figures(cameras, faces, points, normals, law)
     return [
-        {**common, "surface": name, **figures.over(mask, mesh.face_areas, options.budget_um)}
+        {**common, "surface": name, **figures.summarise(mask, mesh.face_areas, options.budget_um)}
         for name, mask in tooth.surfaces.items()
     ]
 
@@ -252,7 +252,7 @@ class _Figures:
     expected_um: Float[np.ndarray, "n"]
     growth: Float[np.ndarray, "n"]
 
-    def over(self, surface: Bool[np.ndarray, "f"], areas_mm2: Float[np.ndarray, "f"], budget_um: float) -> Row:
+    def summarise(self, surface: Bool[np.ndarray, "f"], areas_mm2: Float[np.ndarray, "f"], budget_um: float) -> Row:
         """Shares and means over one surface."""
         inside = surface[self.faces]
         matched = inside & self.matched

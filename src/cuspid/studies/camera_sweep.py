@@ -43,7 +43,7 @@ from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import TOOTH, Options, Range
 from cuspid.runtime.progress import Progress, silent
 from cuspid.simulation.appearance import Preset
-from cuspid.simulation.path.detour import repaired
+from cuspid.simulation.path.detour import repair_path
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
 from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
@@ -227,7 +227,7 @@ def held_clear(
 
     A sweep keeps its distance: raises InputError where a frame would have to move the pair by more than a hand drifts.
     """
-    poses = dict(zip(rig_from_world, repaired(room, list(rig_from_world.values())), strict=True))
+    poses = dict(zip(rig_from_world, repair_path(room, list(rig_from_world.values())), strict=True))
     moved = [
         np.linalg.norm((pair_from_rig @ rig_from_world[name]).inverse().translation - after.inverse().translation)
         for name, after in ((name, pair_from_rig @ pose) for name, pose in poses.items())

@@ -34,7 +34,7 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import COARSEST_MM, PhantomOptions
 from cuspid.anatomy.phantom.population import draw_population
 from cuspid.anatomy.preparation.prepare import prepare, preset
-from cuspid.anatomy.shape.boxed import boxed
+from cuspid.anatomy.shape.boxed import box_crowns
 from cuspid.anatomy.shape.mean import mean_shape
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.evaluation.crown import open_faces
@@ -174,7 +174,7 @@ def _boxed_mean(edge_mm: float) -> Jaw:
     drawn = draw_population(
         "lower-14", _MEAN_COUNT, np.random.default_rng(0), PhantomOptions(edge_mm=max(edge_mm, _MEAN_EDGE_MM))
     )
-    return boxed(mean_shape({str(number): build_phantom(each) for number, each in enumerate(drawn)}).mean)
+    return box_crowns(mean_shape({str(number): build_phantom(each) for number, each in enumerate(drawn)}).mean)
 
 
 _JAWS: Mapping[str, Callable[[float], Jaw]] = MappingProxyType(

@@ -55,7 +55,7 @@ def sections_of(jaw: Jaw, teeth: Sequence[int], brief: DesignBrief) -> list[Sect
 
     def section(fdi: int) -> Section:
         passes = ScanPathOptions(tooth=fdi, turns=brief.motion.turns, turn_deg=brief.motion.turn_deg)
-        return Section.near(jaw.mesh, jaw.tooth_faces(fdi), surfaces, steady_poses(jaw, passes, per_pass=5))
+        return Section.cut(jaw.mesh, jaw.tooth_faces(fdi), surfaces, steady_poses(jaw, passes, per_pass=5))
 
     return [section(fdi) for fdi in teeth]
 

@@ -271,7 +271,7 @@ class NoiseFit:
     """Where the variance has doubled; infinite where it does not grow."""
 
 
-def binned(
+def bin_samples(
     samples: MatchingSamples, edges: Sequence[float], by: Literal["deformation", "convergence_deg"] = "deformation"
 ) -> list[dict[str, float]]:
     """Count, share matched, and noise in each bin: RMS error over root two, for both images share it."""

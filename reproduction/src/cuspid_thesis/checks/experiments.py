@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.preparation.prepare import preset
-from cuspid.anatomy.shape.boxed import boxed, crown_boxes
+from cuspid.anatomy.shape.boxed import box_crowns, crown_boxes
 from cuspid.anatomy.surfaces import SURFACES
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DESIGNS, DesignOptions
@@ -105,7 +105,7 @@ def designs() -> Figures:
 
 def box_sizes() -> Figures:
     """Fig 3.17: a crown beside its box in the boxed jaw, both measured along the axes of the box."""
-    made, apart = boxed(phantom()), 0.0
+    made, apart = box_crowns(phantom()), 0.0
     for fdi, box in crown_boxes(phantom()).items():
         crown = (phantom().mesh.submesh(phantom().tooth_faces(fdi)).vertices @ box.axes).max(axis=0)
         faces = (made.mesh.submesh(made.tooth_faces(fdi)).vertices @ box.axes).max(axis=0)

@@ -29,14 +29,14 @@ def phantoms_drawn(results: Results) -> tuple[Row, ...]:
     """Means of drawn phantoms beside Table 2.1. f of twelve teeth has no source of its own, and is left out."""
     drawn = results.get("populations", {}).get("groups", {})
     return tuple(
-        _drawn(group, name, drawn[group.lower()]["jaws"] if group.lower() in drawn else 16)
+        _row_of_draws(group, name, drawn[group.lower()]["jaws"] if group.lower() in drawn else 16)
         for group, printed in PRINTED_TABLE.items()
         for name in printed
         if name != "f" or group.endswith("14")
     )
 
 
-def _drawn(group: str, name: str, jaws: int) -> Row:
+def _row_of_draws(group: str, name: str, jaws: int) -> Row:
     error = PRINTED_TABLE[group][name][1] / np.sqrt(jaws)
     path = f"groups.{group.lower()}.{name}.measured"
     because = "impossible draws are rejected and drawn again"
@@ -48,14 +48,14 @@ def jaws_scanned(results: Results) -> tuple[Row, ...]:
     """Means of scanned jaws beside Table 2.1, of groups with more than one."""
     groups = results.get("measure", {}).get("real", {}).get("groups", [])
     return tuple(
-        _scanned(f"real.groups.{number}", entry, name)
+        _row_of_scans(f"real.groups.{number}", entry, name)
         for number, entry in enumerate(groups)
         if entry["group"] in PRINTED_TABLE and entry["jaws"] > 1
         for name in "abcf"
     )
 
 
-def _scanned(path: str, entry: Mapping[str, Any], name: str) -> Row:
+def _row_of_scans(path: str, entry: Mapping[str, Any], name: str) -> Row:
     group, count, sd = entry["group"], entry[f"{name}_n"], entry[f"{name}_sd_mm"]
     printed_sd = PRINTED_TABLE[group][name][1]
     error = np.hypot((sd or 0.0) / np.sqrt(max(count, 1)), printed_sd / np.sqrt(_CT_MODELS[group]))

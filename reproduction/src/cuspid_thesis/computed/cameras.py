@@ -9,23 +9,23 @@ from typing import Any
 import numpy as np
 
 from cuspid_thesis.checks.cameras import BASELINES_MM
-from cuspid_thesis.results import Result, at
+from cuspid_thesis.results import Result, value_at
 
 
 def ratio(result: Result, of: str, to: str) -> Mapping[str, float]:
     """One figure over another."""
-    return {"ours": at(result, of) / at(result, to)}
+    return {"ours": value_at(result, of) / value_at(result, to)}
 
 
 def more(result: Result, one: str, other: str) -> Mapping[str, Any]:
     """Whether one figure is larger than the other."""
-    values = {"one": at(result, one), "other": at(result, other)}
+    values = {"one": value_at(result, one), "other": value_at(result, other)}
     return {"ours": values["one"] > values["other"], **values}
 
 
 def covers(result: Result, least: str, largest: str, thesis: Sequence[float]) -> Mapping[str, Any]:
     """Whether the range between two figures holds that of the thesis."""
-    low, high = at(result, least), at(result, largest)
+    low, high = value_at(result, least), value_at(result, largest)
     return {"ours": bool(low <= thesis[0] and high >= thesis[1]), "low": low, "high": high}
 
 

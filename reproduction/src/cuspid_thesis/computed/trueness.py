@@ -9,7 +9,7 @@ import numpy as np
 
 from cuspid_thesis.catalogue import TABLE_3_2, Row, TruenessRow
 from cuspid_thesis.page_format import Table
-from cuspid_thesis.results import Result, Results, at
+from cuspid_thesis.results import Result, Results, value_at
 from cuspid_thesis.rules import Equals, LessIsBetter
 
 _FIELDS: Mapping[str, str] = MappingProxyType(
@@ -63,11 +63,11 @@ def trueness_table(results: Results) -> Table | None:
 
 
 def _trueness_cells(row: TruenessRow, result: Result) -> tuple[str, ...]:
-    found = at(result, row.path)
+    found = value_at(result, row.path)
     within = "completeness_pct" if row.tooth is None else f"per_tooth_completeness_pct.{row.tooth}"
     columns = ("min_um", "max_um", "mean_abs_um", "std_abs_um", "rms_um", "p95_um")
     printed = "/".join(f"{value:g}" for value in (row.min_um, row.max_um, row.mean_um, row.std_um))
-    figures = (*(found[name] for name in columns), at(result, f"trueness.{within}.50"))
+    figures = (*(found[name] for name in columns), value_at(result, f"trueness.{within}.50"))
     return (row.part, str(row.tooth or "all"), *(f"{value:.1f}" for value in figures), printed)
 
 

@@ -169,7 +169,7 @@ def collapse_of(placed: list[Placed], options: ThesisOptions) -> str | None:
         return "the next frame reaches beyond the horizon"
     if worst > options.max_stretch:
         return f"the next frame is stretched by a factor of {worst:.3g}"
-    canvas = Canvas.around(placed)
+    canvas = Canvas.from_frames(placed)
     if canvas.width * canvas.height > 1e6 * options.max_canvas_mpx:
         return f"the panorama grows beyond {options.max_canvas_mpx:g} million px"
     return None
@@ -256,7 +256,7 @@ _PLANE_NOTE = (
 
 def _lay(sequence: ImageSequence, camera: Camera, chain: Chain, part: int, progress: Progress) -> Blend:
     """All frames of a part on its canvas; the pixels of frames as the lens distorts them."""
-    blend = Blend(Canvas.around(chain.placed))
+    blend = Blend(Canvas.from_frames(chain.placed))
     for done, placed in enumerate(chain.placed, start=1):
         blend.add(placed, without_distortion(sequence.image(placed.index), camera))
         progress(f"mosaic, part {part}", done, len(chain.placed))

@@ -80,7 +80,7 @@ class Canvas:
     """Rows."""
 
     @staticmethod
-    def around(frames: Iterable[Placed]) -> Canvas:
+    def from_frames(frames: Iterable[Placed]) -> Canvas:
         """Around the corners of all frames."""
         corners = np.concatenate([placed.corners for placed in frames])
         low, high = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0))

@@ -91,7 +91,7 @@ def _rays(camera: Camera) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "
     return rays[..., 0].copy(), rays[..., 1].copy()
 
 
-def _halved(camera: Camera) -> Camera:
+def _halve(camera: Camera) -> Camera:
     """The same view in half as many pixels, rounded down."""
     return replace(
         camera,
@@ -108,7 +108,7 @@ def _solve(
     """log |P| for log(rho / E): first on a smaller image, then here."""
     start = target / 2
     if min(target.shape) >= 2 * _COARSEST_PX:
-        small = _halved(camera)
+        small = _halve(camera)
         size = (small.width, small.height)
         share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         mean = cv2.resize(np.where(known, target, 0), size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
@@ -175,13 +175,13 @@ def _normals(
 def _slope(values: Float[np.ndarray, "h w"], axis: int) -> Float[np.ndarray, "h w"]:
     """Central difference for each px; one-sided beside NaN and at the border, 0 where there is no neighbour."""
     step = np.diff(values, axis=axis)
-    both = [np.concatenate(pair, axis) for pair in _padded(step, axis)]
+    both = [np.concatenate(pair, axis) for pair in _pad(step, axis)]
     count = sum(np.isfinite(each) for each in both)
     total = sum(np.nan_to_num(each) for each in both)
     return np.asarray(total / np.maximum(count, 1), dtype=np.float32)
 
 
-def _padded(step: Float[np.ndarray, "h w"], axis: int) -> list[list[np.ndarray]]:
+def _pad(step: Float[np.ndarray, "h w"], axis: int) -> list[list[np.ndarray]]:
     """The differences before and after each pixel, NaN beyond the border."""
     border = np.full_like(np.take(step, [0], axis=axis), np.nan)
     return [[border, step], [step, border]]

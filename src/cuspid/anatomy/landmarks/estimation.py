@@ -276,7 +276,7 @@ def _buccal_groove(view: ToothView, bow: float, cusps: Mapping[str, Place]) -> P
     mesial, distal = cusps["mesiobuccal_cusp"], cusps["distobuccal_cusp"]
     run = np.linspace(0.15, 0.85, 71)
     line = mesial + run[:, None] * (distal - mesial) + [0.0, bow * view.half_depth_mm]
-    heights = view.sampled(line)
+    heights = view.sample(line)
     tips = np.interp(run, [0.0, 1.0], view.surface(np.stack([mesial, distal])))
     depth = np.where(np.isfinite(heights), tips - heights, -_FARTHEST_CUSP_MM)
     weights = np.exp((depth - depth.max()) / _GROOVE_CAP_MM)

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from cuspid.geometry import Rigid3
 from cuspid.model.jaw import UNIVERSAL_FROM_FDI, Landmark
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 
 ToothKind = Literal["incisor", "canine", "premolar", "molar"]
 
@@ -108,7 +108,7 @@ def validate(landmarks: Iterable[str], teeth: Collection[int] = (), *, source: s
     scheme = labels_of(UNIVERSAL_FROM_FDI)
     for label in landmarks:
         if label not in scheme:
-            raise InputError(f"{source}: unknown landmark {shown(label)}; {_advice(label, scheme)}")
+            raise InputError(f"{source}: unknown landmark {quote(label)}; {_advice(label, scheme)}")
         if teeth and not set(teeth_named([label])) <= set(teeth):
             has = ", ".join(map(str, sorted(teeth)))
             raise InputError(f"{source}: landmark '{label}' belongs to no tooth of this jaw, which has {has} (FDI)")

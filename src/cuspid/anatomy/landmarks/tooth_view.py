@@ -124,7 +124,7 @@ class ToothView:
         weights = np.where(near, np.exp((values - values[best]) / _CAP_MM), 0.0)
         return np.asarray(np.einsum("mn,mnk->k", weights, self.places) / weights.sum())
 
-    def sampled(self, places: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
+    def sample(self, places: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
         """What summits are looked for in, at the grid point nearest to each place; minus infinity beside the tooth."""
         rows, columns = np.rint((places - self.places[0, 0]) / self.grid_mm).astype(int).T
         height, width = self.heights.shape

@@ -193,7 +193,7 @@ def _aim(options: PhantomOptions, rows: Rows) -> Aim:
 def _resize_teeth(rows: Rows, size: float) -> Rows:
     """The teeth at another size."""
 
-    def scaled(tooth: Tooth) -> Tooth:
+    def resize(tooth: Tooth) -> Tooth:
         crown = tooth.crown
         return replace(
             tooth,
@@ -205,7 +205,7 @@ def _resize_teeth(rows: Rows, size: float) -> Rows:
             ),
         )
 
-    return {side: tuple((position, scaled(tooth)) for position, tooth in row) for side, row in rows.items()}
+    return {side: tuple((position, resize(tooth)) for position, tooth in row) for side, row in rows.items()}
 
 
 def _chains(rows: Rows, closing: dict[int, Float[np.ndarray, "_"]], arch: Arch) -> tuple[Chain, Chain]:

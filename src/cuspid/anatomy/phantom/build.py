@@ -63,10 +63,10 @@ def _solid(options: PhantomOptions) -> Solid:
     individuals = vary_teeth(options, rng)
     waves = Gum.random_waves(rng)
 
-    def around(teeth: tuple[PlacedTooth, ...]) -> Solid:
-        return Solid(teeth=teeth, gum=Gum.around(teeth, waves))
+    def add_gum(teeth: tuple[PlacedTooth, ...]) -> Solid:
+        return Solid(teeth=teeth, gum=Gum.from_teeth(teeth, waves))
 
-    return around(place_teeth(options, individuals, lambda teeth: papilla(around(teeth), options.arch)))
+    return add_gum(place_teeth(options, individuals, lambda teeth: papilla(add_gum(teeth), options.arch)))
 
 
 def _through(

@@ -34,7 +34,7 @@ class Gum:
     """Unevenness: wave vector (rad/mm) and phase of each wave."""
 
     @staticmethod
-    def around(teeth: tuple[PlacedTooth, ...], waves: Float[np.ndarray, "w 4"]) -> "Gum":
+    def from_teeth(teeth: tuple[PlacedTooth, ...], waves: Float[np.ndarray, "w 4"]) -> "Gum":
         """The ridge that holds the teeth, uneven by the given waves."""
         cervices = np.array([placed.origin for placed in teeth])
         first, last = (_beyond(cervices[k], cervices[j]) for k, j in ((0, 1), (-1, -2)))

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from cuspid.anatomy.booleans import CAVITY, TROUGH, Cut, Tool, closed, rim_of, subtract
+from cuspid.anatomy.booleans import CAVITY, TROUGH, Cut, Tool, close_holes, rim_of, subtract
 from cuspid.anatomy.edges import neighbours_of
 from cuspid.anatomy.preparation.crack_tool import CrackShape, crack_tool
 from cuspid.anatomy.preparation.crown_tool import CrownShape, crown_tool
@@ -190,7 +190,7 @@ def prepare(jaw: Jaw, preparations: Mapping[int, PreparationOptions]) -> Jaw:
     sites = {fdi: site_of(jaw, fdi) for fdi in preparations}
     tools = {fdi: _tool(sites[fdi], options) for fdi, options in preparations.items()}
     cut = subtract(
-        closed(jaw.mesh),
+        close_holes(jaw.mesh),
         [(tools[fdi], _blocks(sites[fdi], preparations)) for fdi in preparations],
         [f"tooth {fdi}" for fdi in preparations],
     )

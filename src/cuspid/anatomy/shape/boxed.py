@@ -17,7 +17,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
 
-from cuspid.anatomy.booleans import closed, solid_of
+from cuspid.anatomy.booleans import close_holes, solid_of
 from cuspid.model.jaw import GUM, Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
@@ -58,7 +58,7 @@ class Box:
         return self.high - self.low
 
 
-def boxed(jaw: Jaw, options: BoxOptions = BoxOptions()) -> Jaw:
+def box_crowns(jaw: Jaw, options: BoxOptions = BoxOptions()) -> Jaw:
     """The jaw with every crown replaced by its box, watertight, with the FDI number of each face.
 
     An open scan is closed by a point below it. Landmarks, lines and spheres are dropped: they would not lie on the
@@ -66,7 +66,7 @@ def boxed(jaw: Jaw, options: BoxOptions = BoxOptions()) -> Jaw:
     """
     if not jaw.teeth or jaw.face_labels is None:
         raise InputError("boxed jaw: the jaw has no tooth labels; label its faces with FDI numbers (0 = gum)")
-    whole = closed(jaw.mesh)
+    whole = close_holes(jaw.mesh)
     before = np.pad(jaw.face_labels, (0, len(whole.faces) - len(jaw.mesh.faces)), constant_values=GUM)
     body = solid_of(whole, "boxed jaw")
     boxes = [_solid_box(box, options) for box in crown_boxes(jaw).values()]

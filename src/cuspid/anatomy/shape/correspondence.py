@@ -106,7 +106,7 @@ class Template:
             averaging=_averaging(mesh.faces, count),
         )
 
-    def smoothed(
+    def smooth(
         self, values: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, "v"], sigma_mm: float
     ) -> Float[np.ndarray, "v 3"]:
         """Weighted mean of the values round each vertex, by diffusion over the surface."""
@@ -198,9 +198,9 @@ def fit(template: Template, start: Float[np.ndarray, "v 3"], target: Target, opt
     vertices = start
     for sigma_mm in options.smoothing_mm:
         offsets, found = partners(template, vertices, target, options)
-        vertices = vertices + template.smoothed(offsets, found.astype(np.float64), sigma_mm)
+        vertices = vertices + template.smooth(offsets, found.astype(np.float64), sigma_mm)
     offsets, found = partners(template, vertices, target, options)
-    followed = template.smoothed(offsets, found.astype(np.float64), options.smoothing_mm[-1])
+    followed = template.smooth(offsets, found.astype(np.float64), options.smoothing_mm[-1])
     return Fit(vertices=vertices + np.where(found[:, None], offsets, followed), covered=found)
 
 

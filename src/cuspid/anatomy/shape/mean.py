@@ -70,13 +70,13 @@ class _Samples:
     by_tooth: bool
     """Whether every jaw has tooth labels."""
 
-    def aligned(self, number: int, jaw: Jaw) -> Mesh:
+    def align(self, number: int, jaw: Jaw) -> Mesh:
         """The surface of a jaw in the common frame."""
         return replace(jaw.mesh, vertices=self.pose.apply(number, jaw.mesh.vertices))
 
     def target(self, number: int, jaw: Jaw) -> Target:
         """The surface of a jaw in the common frame, by label."""
-        mesh = self.aligned(number, jaw)
+        mesh = self.align(number, jaw)
         return Target.of(mesh, labels_or_gum(jaw.face_labels if self.by_tooth else None, len(mesh.faces)))
 
 
@@ -155,7 +155,7 @@ def _iterate(
     """The mean, where it lies on each sample, and what happened."""
     number = list(samples.jaws).index(first)
     jaw = samples.jaws[first]
-    start = samples.aligned(number, jaw)
+    start = samples.align(number, jaw)
     mean = Mesh(warp(samples.pose.aligned[number], samples.pose.mean, start.vertices), start.faces)
     template = Template.of(mean, labels_or_gum(jaw.face_labels if samples.by_tooth else None, len(mean.faces)))
     log: list[MeanStep] = []

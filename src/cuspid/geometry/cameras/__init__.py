@@ -5,7 +5,7 @@ from cuspid.geometry.cameras.models import GRID, LENSES, MODELS, LensModel, fold
 from cuspid.geometry.cameras.projection import (
     camera_jacobian,
     directions_through,
-    distorted,
+    distort,
     project_points,
     projection_derivatives,
 )
@@ -17,7 +17,7 @@ __all__ = [
     "LensModel",
     "camera_jacobian",
     "directions_through",
-    "distorted",
+    "distort",
     "fold_radius",
     "project_points",
     "projection_derivatives",

@@ -116,7 +116,7 @@ def _shift(k, u, v):
 
 @kernel
 @no_type_check
-def distorted(model, k, u, v):
+def distort(model, k, u, v):
     """Where a lens shows a place of the ideal one, before focal length and principal point."""
     r2 = u * u + v * v
     radial, _, _ = _radial(model, k, r2)
@@ -133,7 +133,7 @@ def distorted(model, k, u, v):
 @kernel
 @no_type_check
 def _by_ideal(model, k, u, v):
-    """Derivatives of :func:`distorted` by u and v: of the first by both, then of the second."""
+    """Derivatives of :func:`distort` by u and v: of the first by both, then of the second."""
     r2 = u * u + v * v
     radial, slope, _ = _radial(model, k, r2)
     if model == _SPLINED:
@@ -179,7 +179,7 @@ def camera_jacobian(model, k, x, y, z, pixel, by_point, by_parameters):
     """
     fx, fy = k[0], k[1]
     u, v = _ideal(model, x, y, z)
-    xd, yd = distorted(model, k, u, v)
+    xd, yd = distort(model, k, u, v)
     pixel[0], pixel[1] = fx * xd + k[2], fy * yd + k[3]
     xu, xv, yu, yv = _by_ideal(model, k, u, v)
     if model <= _FULL_OPENCV:
@@ -240,7 +240,7 @@ def _project_points(model, k, limit, points, out):
             continue
         u, v = _ideal(model, x, y, z)
         if u * u + v * v <= limit * limit:
-            xd, yd = distorted(model, k, u, v)
+            xd, yd = distort(model, k, u, v)
             out[n, 0], out[n, 1] = xd * k[0] + k[2], yd * k[1] + k[3]
 
 
@@ -266,7 +266,7 @@ def _invert_distortion(model, k, limit, a, b):
         length = np.hypot(u, v)
         if length > limit:
             u, v = _INSIDE * u * limit / length, _INSIDE * v * limit / length
-        xd, yd = distorted(model, k, u, v)
+        xd, yd = distort(model, k, u, v)
         xu, xv, yu, yv = _by_ideal(model, k, u, v)
         determinant = xu * yv - xv * yu
         step_u, step_v = (yv * (xd - a) - xv * (yd - b)) / determinant, (xu * (yd - b) - yu * (xd - a)) / determinant
@@ -277,7 +277,7 @@ def _invert_distortion(model, k, limit, a, b):
         u, v = u - share * step_u, v - share * step_v
         if abs(step_u) + abs(step_v) < _SETTLED:
             break
-    xd, yd = distorted(model, k, u, v)
+    xd, yd = distort(model, k, u, v)
     if not abs(xd - a) + abs(yd - b) < _WRONG or np.hypot(u, v) > limit:
         return np.nan, np.nan
     return u, v

@@ -107,7 +107,7 @@ def block(box: Box) -> Manifold:
 
 
 def _shells(shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
-    blocks = {name: rounded(box, options.rounding_mm) for name, box in shell.blocks.items()}
+    blocks = {name: make_rounded_box(box, options.rounding_mm) for name, box in shell.blocks.items()}
     handle = {"neck": _neck(shell.handle, options)}
     if options.grip_mm:
         handle["grip"] = _grip(shell.handle, options, inside_mm=0.0)
@@ -126,7 +126,7 @@ def _ducts(shell: Shell, options: PrintOptions) -> dict[str, Manifold]:
     return {**heads, **arms, "bore of the neck": block(through), **grip}
 
 
-def rounded(box: Box, radius_mm: float) -> Manifold:
+def make_rounded_box(box: Box, radius_mm: float) -> Manifold:
     """A box with rounded edges, within the box."""
     return _place_solid(_rounded_box(box.half_mm, radius_mm), box.box_from_rig)
 

@@ -74,7 +74,7 @@ class TagGrid:
         """Id of the tag at each place, from the top left."""
         return self.first_id + np.arange(self.rows * self.columns).reshape(self.rows, self.columns)[::-1]
 
-    def beside(self, tag: int) -> Int[np.ndarray, "m"]:
+    def neighbours(self, tag: int) -> Int[np.ndarray, "m"]:
         """Ids of a tag and of those around it."""
         row, column = np.argwhere(self.ids == tag)[0]
         return self.ids[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].ravel()

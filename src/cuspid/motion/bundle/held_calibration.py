@@ -42,11 +42,11 @@ def _place_factor(place: Float[np.ndarray, "3"], cameras: list[MountedCamera]) -
     square, factors = np.zeros((3, 3)), []
     for mounted in cameras:
 
-        def seen(step: Float[np.ndarray, "k"], mounted: MountedCamera = mounted) -> Float[np.ndarray, "2"]:
+        def project_moved(step: Float[np.ndarray, "k"], mounted: MountedCamera = mounted) -> Float[np.ndarray, "2"]:
             return _project_perturbed(mounted, place + step[:3], step[3:])
 
         numbers = len(mounted.camera.parameters)
-        by_all = _jacobian(seen, 3 + numbers + _MOTION)
+        by_all = _jacobian(project_moved, 3 + numbers + _MOTION)
         by_place, by_camera = by_all[:, :3], by_all[:, 3:]
         lens = covariance_factor(mounted.camera.covariance, numbers)
         motion = covariance_factor(mounted.covariance, _MOTION)

@@ -82,7 +82,7 @@ class Features:
         return len(self.pixels)
 
 
-def spread(
+def select_evenly(
     pixels: Float[np.ndarray, "n 2"], strengths: Float[np.ndarray, "n"], count: int, cell_px: int
 ) -> Int[np.ndarray, "m"]:
     """Indices of at most ``count`` keypoints: the strongest of every cell, then the second of every cell, and so on."""
@@ -136,7 +136,7 @@ def detect(
     if options.upright:
         keypoints = without_doubles(keypoints)
     most = options.count_for(width, height)
-    chosen = spread(px * _places(keypoints), np.array([k.response for k in keypoints]), most, options.cell_px)
+    chosen = select_evenly(px * _places(keypoints), np.array([k.response for k in keypoints]), most, options.cell_px)
     keypoints = [keypoints[index] for index in chosen]
     if options.upright:
         for keypoint in keypoints:
@@ -156,10 +156,10 @@ def _load(path: Path) -> Features:
 
 def _where_shown(mask: UInt8[np.ndarray, "h w"] | None, lens: Camera) -> UInt8[np.ndarray, "h w"] | None:
     """The mask without what the model of the lens has no direction for."""
-    if lens.shown is None:
+    if lens.valid_mask is None:
         return mask
-    whole = np.full(lens.shown.shape, 255, dtype=np.uint8) if mask is None else mask
-    return np.where(lens.shown, whole, np.uint8(0))
+    whole = np.full(lens.valid_mask.shape, 255, dtype=np.uint8) if mask is None else mask
+    return np.where(lens.valid_mask, whole, np.uint8(0))
 
 
 def _detect_kept(
@@ -172,7 +172,7 @@ def _detect_kept(
         return detect(pictures.image(frame, camera), options, mask)
     path = stage.folder / camera / f"{frame.name}.npz"
     made_from = {"image": pictures.capture.source.digest(frame.name, camera)}
-    if lens.shown is not None:
+    if lens.valid_mask is not None:
         made_from["lens"] = digest_of([lens.model, lens.parameters])
     key = stage.key(made_from)
     if stage.has(key, [path]):
@@ -196,8 +196,8 @@ def detect_all(
     stage = None if cache is None else Stage("features", cache / "features", options, (__name__,))
     images = [(frame, camera) for frame in pictures.capture.frames for camera in frame.cameras]
 
-    def kept(image: tuple[Frame, str]) -> Features:
+    def detect_kept(image: tuple[Frame, str]) -> Features:
         return _detect_kept(pictures, *image, options, stage)
 
-    found = map_in_threads(kept, images, stage="features", progress=progress)
+    found = map_in_threads(detect_kept, images, stage="features", progress=progress)
     return {(frame.name, camera): features for (frame, camera), features in zip(images, found, strict=True)}

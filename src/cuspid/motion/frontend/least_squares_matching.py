@@ -69,7 +69,7 @@ class _Views:
         rotations = np.array([[pose.rotation for pose in row] for row in poses])
         return _Views(found, rotations, np.array([[pose.translation for pose in row] for row in poses]))
 
-    def towards(self, tracks: Tracks) -> Float[np.ndarray, "o 3"]:
+    def directions_to_cameras(self, tracks: Tracks) -> Float[np.ndarray, "o 3"]:
         """For each observation the unit vector from its point to the camera."""
         centres = -np.einsum("fcji,fcj->fci", self.rotations, self.translations)
         rays = centres[tracks.frame_index, tracks.camera_index] - tracks.points[tracks.point_index]
@@ -105,7 +105,7 @@ class _Facets(NamedTuple):
 
 
 def _facets(views: _Views, tracks: Tracks) -> _Facets:
-    own = own_observations(tracks, views.towards(tracks))
+    own = own_observations(tracks, views.directions_to_cameras(tracks))
     normals, stencils = normals_of(tracks.points), np.zeros((len(tracks.points), len(_STENCIL), 3))
     for index, mounted in enumerate(views.found.rig.cameras.values()):
         mine = own[tracks.camera_index[own] == index]
@@ -152,10 +152,10 @@ class _Matching:
         patches = np.zeros((len(self.tracks.points), side, side), dtype=np.float32)
         parts = _by_image(self.tracks, own)
 
-        def cut(part: tuple[Image, Int[np.ndarray, "_"]]) -> Float32[np.ndarray, "_ s s"]:
+        def cut_part(part: tuple[Image, Int[np.ndarray, "_"]]) -> Float32[np.ndarray, "_ s s"]:
             return cut_patches(self.picture(part[0]), self.tracks.pixels[part[1]], self.options.radius_px)
 
-        for mine, some in zip(parts.values(), map_in_threads(cut, parts.items()), strict=True):
+        for mine, some in zip(parts.values(), map_in_threads(cut_part, parts.items()), strict=True):
             patches[self.tracks.point_index[mine]] = some
         return patches
 

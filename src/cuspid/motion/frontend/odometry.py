@@ -22,7 +22,7 @@ from cuspid.model.capture import Dropped
 from cuspid.model.rig import Handpiece, Rig
 from cuspid.motion.bundle.normal_equations import pose_equations
 from cuspid.motion.colmap import find_rig_pose
-from cuspid.motion.frontend.features import Features, spread
+from cuspid.motion.frontend.features import Features, select_evenly
 from cuspid.motion.frontend.pairs import IndexedFeatures, MatchingOptions, match_guided, match_unguided
 from cuspid.motion.frontend.tracks import intersect_rays, join
 from cuspid.runtime.options import SHARE, Options, Range
@@ -181,7 +181,7 @@ def _best_known(cloud: Cloud, view: IndexedFeatures, camera: str, count: int) ->
     known = np.flatnonzero(cloud.point_of[camera] >= 0)
     sightings = np.bincount(np.concatenate([p[p >= 0] for p in cloud.point_of.values()]), minlength=1)
     strength = sightings[cloud.point_of[camera][known]].astype(np.float64)
-    return known[spread(view.features.pixels[known], strength, count, _CELL_PX)]
+    return known[select_evenly(view.features.pixels[known], strength, count, _CELL_PX)]
 
 
 def _sightings(

@@ -244,11 +244,11 @@ class _Views(NamedTuple):
         shifts = np.array([pose.translation for pose in cam_from_world])
         return _Views(tuple(names), frames, tuple(cameras), rotations, shifts)
 
-    def inside(self, image: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    def to_camera(self, image: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Points in the camera of an image."""
         return np.asarray(points @ self.rotations[image].T + self.shifts[image])
 
-    def outside(self, image: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    def to_world(self, image: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Points of the camera of an image in the world."""
         return np.asarray((points - self.shifts[image]) @ self.rotations[image])
 
@@ -260,7 +260,7 @@ class _Views(NamedTuple):
         """Unit vectors from points to the camera."""
         return unit(self.centre(image) - points)
 
-    def near(self, first: int, last: int, reach: int) -> Int[np.ndarray, "n"]:
+    def neighbours(self, first: int, last: int, reach: int) -> Int[np.ndarray, "n"]:
         """The images from the frame of one to that of another, and of so many frames before and after them."""
         return np.flatnonzero((self.frames >= self.frames[first] - reach) & (self.frames <= self.frames[last] + reach))
 
@@ -309,7 +309,7 @@ class _Scene(NamedTuple):
         middles, points = tracks.pixels[own], tracks.point_index[own]
         rays = camera.rays(middles[:, None] + _patch_offsets(radius))
         if self.surface is None:
-            depths = self.views.inside(image, tracks.points[points])[:, 2:]
+            depths = self.views.to_camera(image, tracks.points[points])[:, 2:]
         else:
             centre = self.views.centre(image)
             towards = (rays @ self.views.rotations[image]).reshape(-1, 3)
@@ -317,7 +317,7 @@ class _Scene(NamedTuple):
             depths = hits.distances.reshape(rays.shape[:2])
         levels = cut_patches(picture, middles, radius)
         known = np.isfinite(depths).all(axis=1)
-        places = self.views.outside(image, rays * np.where(known[:, None], depths, 1.0)[..., None])
+        places = self.views.to_world(image, rays * np.where(known[:, None], depths, 1.0)[..., None])
         return _Facets(image, points, levels, places).some(known)
 
     def visible(self, there: int, places: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "k"]:
@@ -333,11 +333,11 @@ class _Scene(NamedTuple):
         """Of the points of one image those found in another: points, images, pixels."""
         views, camera, options, middles = self.views, self.views.cameras[there], self.options, facets.middles
         turn = np.sum(views.directions(facets.image, middles) * views.directions(there, middles), axis=1)
-        expected = camera.project(views.inside(there, middles))
+        expected = camera.project(views.to_camera(there, middles))
         seen = camera.contains(expected, 2.0 * options.radius_px) & (turn > np.cos(np.deg2rad(options.turn_deg)))
         seen[seen] = self.visible(there, middles[seen])
         facets, expected = facets.some(seen), expected[seen]
-        offsets = camera.project(views.inside(there, facets.places)) - expected[:, None]
+        offsets = camera.project(views.to_camera(there, facets.places)) - expected[:, None]
         warps, bends = _residual_offsets(offsets, options.radius_px)
         pixels, correlation = align_patches(facets.levels, pictures[there], expected, warps, options, bends)
         good = correlation > options.correlation
@@ -349,13 +349,13 @@ class _Scene(NamedTuple):
         """Of an image some observations, and where their points are found in those near it: points, images, pixels."""
         image, own = start
         facets = self.facets(image, own, pictures[image])
-        near = self.views.near(image, image, self.options.reach)
+        near = self.views.neighbours(image, image, self.options.reach)
         return [
             (self.tracks.point_index[own], np.full(len(own), image), self.tracks.pixels[own]),
             *(self.follow(facets, pictures, other) for other in near.tolist() if other != image),
         ]
 
-    def followed(
+    def follow_all(
         self, read: Callable[[str], UInt8[np.ndarray, "h w"]], progress: Progress
     ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
         """All points where they are found, and in their own images: points, images, pixels. Only images within reach
@@ -365,7 +365,7 @@ class _Scene(NamedTuple):
         count = len(views.names)
         for start in range(0, count, _BLOCK):
             block = range(start, min(start + _BLOCK, count))
-            near = views.near(block[0], block[-1], self.options.reach).tolist()
+            near = views.neighbours(block[0], block[-1], self.options.reach).tolist()
             new = [image for image in near if image not in pictures]
             read_now = map_in_threads(lambda image: smooth(read(views.names[image]), self.options.blur_px), new)
             pictures |= dict(zip(new, read_now, strict=True))
@@ -410,7 +410,7 @@ def follow_points(
     names, tracks = model.frames, model.tracks
     views = _Views.of(names, np.arange(len(names)), (model.camera,) * len(names), tuple(model.cam_from_world.values()))
     scene = _Scene(views, tracks, tracks.frame_index, surface, options)
-    point, frame, pixels = scene.followed(read, progress)
+    point, frame, pixels = scene.follow_all(read, progress)
     return _with_observations(tracks, point, frame, np.zeros_like(frame), pixels)
 
 
@@ -443,7 +443,7 @@ def follow_rig_points(
         return read(frame, camera)
 
     scene = _Scene(views, tracks, image_index.reshape(-1), surface, options)
-    point, seen_in, pixels = scene.followed(image, progress)
+    point, seen_in, pixels = scene.follow_all(image, progress)
     return _with_observations(tracks, point, frame_of[seen_in], camera_of[seen_in], pixels)
 
 

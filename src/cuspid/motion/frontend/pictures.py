@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from cuspid.model.capture import Capture, Frame
-from cuspid.runtime.image_files import Pixels, visible_in_8_bits
+from cuspid.runtime.image_files import Pixels, visible_grey
 
 _BYTES = 400_000_000
 """Memory for the images that are kept."""
@@ -29,14 +28,10 @@ class Pictures:
         """As :meth:`cuspid.model.capture.Capture.fine_image`, with the same errors."""
         image = self.capture.fine_image(frame, camera)
         if (len(self._kept) + 1) * image.shape[0] * image.shape[1] <= self.max_bytes:
-            self._kept[frame.name, camera] = _grey(image)
+            self._kept[frame.name, camera] = visible_grey(image)
         return image
 
     def grey(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w"]:
         """The grey image, read again if it was not kept. Raises InputError as :meth:`image` does."""
         kept = self._kept.get((frame.name, camera))
-        return _grey(self.image(frame, camera)) if kept is None else kept
-
-
-def _grey(image: Pixels) -> UInt8[np.ndarray, "h w"]:
-    return visible_in_8_bits(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
+        return visible_grey(self.image(frame, camera)) if kept is None else kept

@@ -22,7 +22,14 @@ from scipy import sparse
 from cuspid.geometry import Rigid3
 from cuspid.model.reconstruction import Expectation
 from cuspid.motion.bundle.expectation import MOST_POINTS, expectation_of, steps_drawn
-from cuspid.motion.icp.surfaces import Correspondences, OrientedPoints, Surface, match_point_to_plane, moved, solved
+from cuspid.motion.icp.surfaces import (
+    Correspondences,
+    OrientedPoints,
+    Surface,
+    match_point_to_plane,
+    small_motion,
+    solve_damped,
+)
 from cuspid.runtime.progress import Progress
 from cuspid.runtime.workers import map_in_threads
 
@@ -86,7 +93,7 @@ def lay_together(
     for number in range(rounds):
         laid = map_in_threads(partial(_compare_surfaces, some, surfaces, found, distance_mm), pairs)
         step = _step(_in_world(pairs, laid, found), len(found))
-        found = [pose @ moved(motion).inverse() for pose, motion in zip(found, step, strict=True)]
+        found = [pose @ small_motion(motion).inverse() for pose, motion in zip(found, step, strict=True)]
         progress("adjustment", number + 1, rounds)
         if np.abs(step[:, 3:]).max() < _CONVERGED * distance_mm:
             break
@@ -147,7 +154,7 @@ def _step(pairs: Sequence[_Pair], count: int) -> Float[np.ndarray, "f 6"]:
     """Small motions of all frames that bring surfaces together."""
     step = np.zeros((count, 6))
     if pairs:
-        step[1:] = solved(*_equations(pairs, count), _DAMPING).reshape(-1, 6)
+        step[1:] = solve_damped(*_equations(pairs, count), _DAMPING).reshape(-1, 6)
     return step
 
 
@@ -175,7 +182,7 @@ def _covariance(pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: fl
         - _scatter(pairs, in_both, len(poses), len(matrix))
     )
     slope = sum(each.slopes.sum() for *_, each in pairs) / sum(each.weights.sum() for *_, each in pairs)
-    found = solved(matrix, solved(matrix, scatter, _DAMPING).T, _DAMPING) / slope**2
+    found = solve_damped(matrix, solve_damped(matrix, scatter, _DAMPING).T, _DAMPING) / slope**2
     values, vectors = np.linalg.eigh((found + found.T) / 2)
     return np.asarray((vectors * np.clip(values, 0, None)) @ vectors.T)
 

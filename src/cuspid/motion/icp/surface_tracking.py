@@ -26,8 +26,8 @@ from cuspid.motion.icp.surfaces import (
     OrientedPoints,
     Surface,
     match_point_to_plane,
-    moved,
-    solved,
+    small_motion,
+    solve_damped,
     surface_of,
 )
 from cuspid.runtime.errors import ReconstructionError
@@ -121,7 +121,7 @@ def _register_icp(
         laid = match_point_to_plane(one, other, pose, reach, distance_mm)
         if laid is None:
             return _Step(pose, None)
-        pose = moved(-solved(*laid.normal_equations(), _DAMPING)) @ pose
+        pose = small_motion(-solve_damped(*laid.normal_equations(), _DAMPING)) @ pose
     # A start that was made of other poses is a rotation only up to rounding, which would double from frame to frame.
     pose = Rigid3.from_rotation_vector(pose.rotation_vector, pose.translation)
     return _Step(pose, match_point_to_plane(one, other, pose, reaches[-1], distance_mm))
@@ -304,7 +304,7 @@ def _is_near(motion: Rigid3, distance_mm: float) -> bool:
     return max(across, float(np.linalg.norm(motion.rotation_vector))) < _NEAR
 
 
-def adjusted(
+def adjust_poses(
     surfaces: Sequence[Surface],
     poses: Sequence[Rigid3],
     options: SurfaceTrackingOptions,
@@ -340,7 +340,7 @@ def track_surfaces(
     placed, dropped = _track_frames(surfaces, names, options, distance_mm, progress)
     _require_enough(len(placed), len(names), dropped, capture.handpiece, options)
     kept = [surfaces[frame] for frame in placed]
-    poses, scatter_mm, expectation = adjusted(kept, list(placed.values()), options, distance_mm, progress)
+    poses, scatter_mm, expectation = adjust_poses(kept, list(placed.values()), options, distance_mm, progress)
     return Reconstruction(
         rig=capture.handpiece.rig,
         expectation=expectation,

@@ -84,18 +84,18 @@ class Correspondences(NamedTuple):
     """Of the first surface that lies on the second."""
 
     @property
-    def _off(self) -> Float[np.ndarray, "n"]:
+    def _scaled_squares(self) -> Float[np.ndarray, "n"]:
         return np.asarray(np.minimum((self.distances / (_TUKEY * self.sigmas)) ** 2, 1.0))
 
     @property
     def weights(self) -> Float[np.ndarray, "n"]:
         """Tukey's, over the variance."""
-        return np.asarray((1 - self._off) ** 2 / self.sigmas**2)
+        return np.asarray((1 - self._scaled_squares) ** 2 / self.sigmas**2)
 
     @property
     def slopes(self) -> Float[np.ndarray, "n"]:
         """How much weight times distance changes with the distance."""
-        return np.asarray((1 - self._off) * (1 - 5 * self._off) / self.sigmas**2)
+        return np.asarray((1 - self._scaled_squares) * (1 - 5 * self._scaled_squares) / self.sigmas**2)
 
     @property
     def rows(self) -> Float[np.ndarray, "n 6"]:
@@ -184,12 +184,12 @@ def match_point_to_plane(
     return Correspondences(points, normals, distances, sigma * uncertain, sigma, float(near.mean()))
 
 
-def moved(motion: Float[np.ndarray, "6"]) -> Rigid3:
+def small_motion(motion: Float[np.ndarray, "6"]) -> Rigid3:
     """By a small motion: rotation vector, translation."""
     return Rigid3.from_rotation_vector(motion[:3], motion[3:])
 
 
-def solved(
+def solve_damped(
     matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n *k"], damping: float
 ) -> Float[np.ndarray, "n *k"]:
     """The solution of normal equations, with a share of their diagonal added, which only matters where nothing is

@@ -14,13 +14,14 @@ from itertools import combinations
 
 import cv2
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Int, Shaped, UInt8
 
 from cuspid.model.capture import Dropped
 from cuspid.model.photographs import Photograph
 from cuspid.motion.frontend.features import FeatureOptions, Features, detect
 from cuspid.motion.frontend.revisits import WORDS, look, typical
 from cuspid.runtime.errors import InputError
+from cuspid.runtime.image_files import Pixels, visible_grey
 from cuspid.runtime.progress import Progress
 from cuspid.runtime.workers import map_in_threads
 
@@ -72,7 +73,7 @@ def detect_in_all(
 
 
 def _detect(photograph: Photograph, options: FeatureOptions, max_image_px: int, even: bool) -> Features:
-    image, mask = np.ascontiguousarray(photograph.pixels()[..., :3]), photograph.counts()
+    image, mask = np.ascontiguousarray(photograph.pixels()), photograph.counts()
     size = np.array(photograph.size)
     shrink = min(1.0, max_image_px / float(size.max()))
     searched = np.maximum(np.rint(size * shrink), 1).astype(int)
@@ -83,14 +84,14 @@ def _detect(photograph: Photograph, options: FeatureOptions, max_image_px: int, 
     return replace(found, pixels=found.pixels * (size / searched))
 
 
-def _resize(image: UInt8[np.ndarray, "h w *c"], size: Int[np.ndarray, "2"], how: int) -> UInt8[np.ndarray, "a b *c"]:
-    return np.asarray(cv2.resize(image, size.tolist(), interpolation=how), dtype=np.uint8)
+def _resize(image: Shaped[np.ndarray, "h w *c"], size: Int[np.ndarray, "2"], how: int) -> Shaped[np.ndarray, "a b *c"]:
+    return np.asarray(cv2.resize(image, size.tolist(), interpolation=how))
 
 
-def _equalize_contrast(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _equalize_contrast(image: Pixels) -> UInt8[np.ndarray, "h w 3"]:
     """Grey with even local contrast, for what is plain or badly lit."""
     clahe = cv2.createCLAHE(_CLAHE_CLIP, (_CLAHE_TILES, _CLAHE_TILES))
-    return np.repeat(clahe.apply(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))[..., None], 3, axis=2)
+    return np.repeat(clahe.apply(visible_grey(image))[..., None], 3, axis=2)
 
 
 # --- pairs -------------------------------------------------------------------------------------------------------

@@ -94,9 +94,9 @@ def locate_photographs(
     with tempfile.TemporaryDirectory() as folder, quiet():
         for plain in (False, True):
             attempt = _attempt(photographs, order, Path(folder), options, plain=plain, progress=progress)
-            if best is None or attempt.located > best.located:
+            if best is None or attempt.located_count > best.located_count:
                 best = attempt
-            if best.located >= options.enough_share * len(order):
+            if best.located_count >= options.enough_share * len(order):
                 break
         assert best is not None
         if not best.models:
@@ -136,7 +136,7 @@ class _Attempt:
     seconds: Mapping[str, float]
 
     @property
-    def located(self) -> int:
+    def located_count(self) -> int:
         """Number of photographs in the largest model."""
         return len(placed_images(self.models[0])) if self.models else 0
 
@@ -276,7 +276,7 @@ def _notes(photographs: Photographs, model: PhotoModel, found: _Attempt) -> list
     apart = [len(other) for other in others if not other <= placed]
     if apart:
         notes.append(
-            f"the largest of {1 + len(apart)} models is taken, with {found.located} photographs; the others have "
+            f"the largest of {1 + len(apart)} models is taken, with {found.located_count} photographs; the others have "
             f"{', '.join(map(str, apart))}: take photographs between them"
         )
     for name, camera in model.cameras.items():

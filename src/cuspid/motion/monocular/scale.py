@@ -105,7 +105,7 @@ class PickedDistance:
 # --- points seen from several places -----------------------------------------------------------------------------
 
 
-def triangulated(
+def triangulate_point(
     model: PhotoModel, frames: Sequence[str], pixels: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "n"]]:
     """The point whose images lie nearest to places in some photographs, and how far each is off, px (NaN behind a
@@ -120,28 +120,28 @@ def triangulated(
     centres = np.stack([pose.inverse().translation for pose in poses])
     point = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
 
-    def off(place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 2"]:
+    def residuals_px(place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 2"]:
         return np.stack([c.project(p.apply(place)) for c, p in zip(cameras, poses, strict=True)]) - pixels
 
     for _ in range(_ROUNDS):
-        residual = off(point)
+        residual = residuals_px(point)
         step = 1e-6 * float(np.linalg.norm(point - centres, axis=1).mean())
-        jacobian = np.stack([(off(point + step * axis) - residual) / step for axis in np.eye(3)], axis=-1)
+        jacobian = np.stack([(residuals_px(point + step * axis) - residual) / step for axis in np.eye(3)], axis=-1)
         usable = np.isfinite(residual).all(axis=1)
         if usable.sum() < 2:
             break
         point = point - np.linalg.lstsq(jacobian[usable].reshape(-1, 3), residual[usable].ravel(), rcond=None)[0]
-    return point, np.linalg.norm(off(point), axis=1)
+    return point, np.linalg.norm(residuals_px(point), axis=1)
 
 
 def _robust(
     model: PhotoModel, frames: Sequence[str], pixels: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3"] | None:
-    """As :func:`triangulated`, without the places that are off; None where fewer than two are left, or they look from
+    """As :func:`triangulate_point`, without outliers; None where fewer than two photographs are left, or they look from
     nearly one place."""
     frames = list(frames)
     while len(frames) >= 2:
-        point, off = triangulated(model, frames, pixels)
+        point, off = triangulate_point(model, frames, pixels)
         off = np.nan_to_num(off, nan=np.inf)
         if off.max() <= _OFF_PX:
             centres = np.stack([model.cam_from_world[frame].inverse().translation for frame in frames])
@@ -236,7 +236,7 @@ def _misfit(model: PhotoModel, one: BoardSighting, other: BoardSighting) -> floa
     both, at, there = np.intersect1d(one.corner, other.corner, return_indices=True)
     few = slice(None, None, max(1, len(both) // 12))
     off = [
-        triangulated(model, (one.frame, other.frame), np.stack([one.pixels[i], other.pixels[j]]))[1]
+        triangulate_point(model, (one.frame, other.frame), np.stack([one.pixels[i], other.pixels[j]]))[1]
         for i, j in zip(at[few], there[few], strict=True)
     ]
     return float(np.median(np.nan_to_num(np.concatenate(off), nan=np.inf))) if off else np.inf
@@ -313,7 +313,7 @@ def _length(model: PhotoModel, distance: PickedDistance) -> float:
             raise InputError(f"--distance: photograph {frame} could not be located; pick the places in another one")
     ends = []
     for place in range(2):
-        point, off = triangulated(model, distance.frames, distance.pixels[:, place])
+        point, off = triangulate_point(model, distance.frames, distance.pixels[:, place])
         most = max(10.0, 0.01 * max(model.camera(distance.frames[0]).width, 1))
         if not np.nan_to_num(off, nan=np.inf).max() <= most:
             u, v = distance.pixels[0, place]

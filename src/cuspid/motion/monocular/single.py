@@ -38,6 +38,7 @@ from cuspid.motion.monocular.mapping import (
     verify_matches,
 )
 from cuspid.runtime.errors import ReconstructionError
+from cuspid.runtime.image_files import Pixels, as_8_bits, visible_grey
 from cuspid.runtime.options import SEED, SHARE, Options, Range
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import map_in_threads
@@ -132,9 +133,9 @@ class SingleMotion:
 # --- frames ------------------------------------------------------------------------------------------------------
 
 
-def normalise_contrast(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> UInt8[np.ndarray, "h w"]:
+def normalise_contrast(image: Pixels, options: SingleOptions) -> UInt8[np.ndarray, "h w"]:
     """Grey image with even local contrast; dark noise and burnt-out highlights are levelled first."""
-    gray = np.clip(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _DARK, _BURNT)
+    gray = np.clip(visible_grey(image), _DARK, _BURNT)
     tiles = (options.clahe_tiles, options.clahe_tiles)
     return np.asarray(cv2.createCLAHE(options.clahe_clip, tiles).apply(gray), dtype=np.uint8)
 
@@ -158,8 +159,8 @@ def mouth_share(image: UInt8[np.ndarray, "h w 3"]) -> float:
     return float(alike[lit].mean()) if lit.any() else 1.0
 
 
-def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+def _look(image: Pixels, options: SingleOptions) -> _Look:
+    gray = visible_grey(image)
     small = cv2.resize(gray, None, fx=1 / _SMALLER, fy=1 / _SMALLER, interpolation=cv2.INTER_AREA).astype(np.float64)
     smooth = cv2.GaussianBlur(np.clip(gray, _DARK, _BURNT), (0, 0), 1.0).astype(np.float32)
     lit = gray > _DARK
@@ -170,13 +171,16 @@ def _look(image: UInt8[np.ndarray, "h w 3"], options: SingleOptions) -> _Look:
         small=small,
         brightness=float(np.percentile(gray, 99)),
         sharpness=sharpness,
-        mouth_share=mouth_share(image[::_SMALLER, ::_SMALLER]),
+        mouth_share=mouth_share(as_8_bits(image[::_SMALLER, ::_SMALLER])),
     )
 
 
 def _look_at_all(sequence: ImageSequence, options: SingleOptions, progress: Progress) -> list[_Look]:
     return map_in_threads(
-        lambda index: _look(sequence.image(index), options), range(len(sequence)), stage="features", progress=progress
+        lambda index: _look(sequence.fine_image(index), options),
+        range(len(sequence)),
+        stage="features",
+        progress=progress,
     )
 
 
@@ -213,7 +217,7 @@ def _verified_pairs(
 ) -> dict[tuple[int, int], VerifiedPair]:
     """Verified matches of pairs of frames; pairs that have too few are not in it."""
 
-    def verified(pair: tuple[int, int]) -> VerifiedPair | None:
+    def verify(pair: tuple[int, int]) -> VerifiedPair | None:
         one, other = (features[index] for index in pair)
         return verify_matches(
             camera,
@@ -226,7 +230,7 @@ def _verified_pairs(
             seed=options.seed,
         )
 
-    found = map_in_threads(verified, pairs, stage="matching", progress=progress)
+    found = map_in_threads(verify, pairs, stage="matching", progress=progress)
     return {pair: geometry for pair, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
 
@@ -421,7 +425,7 @@ def _refine_part(
     number = {name: index for index, name in enumerate(sequence.names)}
 
     def read(name: str) -> UInt8[np.ndarray, "h w"]:
-        return normalise_contrast(sequence.image(number[name]), options)
+        return normalise_contrast(sequence.fine_image(number[name]), options)
 
     longer = lengthen(by_keypoints, read, options.patches, progress=progress)
     return adjust_model(longer, options.guided.adjustment)
@@ -441,7 +445,7 @@ def refine_on_surface(
     number = {name: index for index, name in enumerate(sequence.names)}
 
     def read(name: str) -> UInt8[np.ndarray, "h w"]:
-        return normalise_contrast(sequence.image(number[name]), options)
+        return normalise_contrast(sequence.fine_image(number[name]), options)
 
     followed = follow_points(part, read, options.patches, surface=surface, progress=progress)
     if not hold_together(followed, len(part.frames), options.min_matches):

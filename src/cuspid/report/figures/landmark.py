@@ -34,7 +34,7 @@ def save_landmark_picture(path: Path, jaw: Jaw, teeth: Sequence[int] = (), *, ti
     columns = max(1, (len(teeth) + 1) // 2)
     figure = new_figure(7.4 + 3.4 * (columns if teeth else 0), 6.6, dpi=78)
     share = 7.0 / figure.get_size_inches()[0]
-    _draw_points(_jaw_axes(figure, (0.01, 0.03, share, 0.89), painted(jaw), 900), jaw.landmarks, size=4.0)
+    _draw_points(_jaw_axes(figure, (0.01, 0.03, share, 0.89), paint_jaw(jaw), 900), jaw.landmarks, size=4.0)
     width = (0.99 - share) / columns
     for k, fdi in enumerate(teeth):
         place = (share + 0.01 + (k // 2) * width, 0.50 - 0.46 * (k % 2), width - 0.01, 0.40)
@@ -57,14 +57,14 @@ def save_measure_picture(
     the others; ``values_mm`` are written beside them. Raises InputError where the jaw lacks a landmark.
     """
     figure = new_figure(8.4, 6.6, dpi=78)
-    axes = _jaw_axes(figure, (0.02, 0.03, 0.96, 0.89), painted(jaw), 900)
+    axes = _jaw_axes(figure, (0.02, 0.03, 0.96, 0.89), paint_jaw(jaw), 900)
     for name, labels in lines.items():
         _draw_length(axes, name, _ends(jaw.landmarks, labels), values_mm[name])
     figure.text(0.03, 0.955, title, fontsize=15, color=_INK, va="center", fontweight="bold")
     save_figure(figure, path)
 
 
-def painted(jaw: Jaw) -> Mesh:
+def paint_jaw(jaw: Jaw) -> Mesh:
     """The mesh of a jaw with gum and teeth in quiet colours of their own."""
     if jaw.face_labels is None:
         return replace(jaw.mesh, colors=None)
@@ -112,7 +112,7 @@ def _draw_tooth(figure: Figure, place: Extent, jaw: Jaw, fdi: int) -> None:
     middle = (near.min(axis=0) + near.max(axis=0))[:2] / 2
     reach = 0.62 * np.ptp(near[:, :2], axis=0).max()
     close = np.all(np.abs(jaw.mesh.face_centres[:, :2] - middle) < reach, axis=1)
-    axes = _jaw_axes(figure, place, painted(jaw).submesh(close), 420)
+    axes = _jaw_axes(figure, place, paint_jaw(jaw).submesh(close), 420)
     own = {label: point for label, point in jaw.landmarks.items() if label.startswith(f"{fdi}.")}
     _draw_points(axes, own, size=6.5)
     axes.set_title(str(fdi), fontsize=12, color=_INK, loc="left", pad=2)

@@ -30,6 +30,7 @@ def calibration_page(result: CalibrationResult) -> str:
             ("worst camera in held-out images", number(max(held_out), 2) if held_out else "–", "px, RMS"),
         ],
         cameras=cameras,
+        frame_ms=None if (rate := found.get("frames_per_s")) is None else 1000 / rate,
         timed=any(each.get("delay_frames") is not None for each in cameras.values()),
         rolling=any(each.get("readout") is not None for each in cameras.values()),
         lenses={} if result.rig is None else {name: _lens(each) for name, each in result.rig.cameras.items()},

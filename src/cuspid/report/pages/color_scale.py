@@ -18,7 +18,7 @@ from cuspid.report.figures.drawing import (
     deviation_map,
     fitting_sigma_um,
 )
-from cuspid.report.pages.page import packed
+from cuspid.report.pages.page import pack_array
 from cuspid.report.pages.shown_mesh import UM_PER_STEP
 
 _COLORS = 257
@@ -68,7 +68,7 @@ class ColorScale:
     def in_scene(self) -> dict[str, Any]:
         """What the viewer needs of it, as plain values for JSON."""
         plain = {name: getattr(self, name) for name in ("name", "end", "signed", "unit", "per_step")}
-        return {**plain, "colors": packed(self._table(_COLORS))}
+        return {**plain, "colors": pack_array(self._table(_COLORS))}
 
     def _table(self, count: int) -> UInt8[np.ndarray, "n 3"]:
         return np.asarray(self.colors(np.linspace(0, 1, count), bytes=True)[:, :3], dtype=np.uint8)

@@ -54,7 +54,7 @@ def _environment(package: str) -> Environment:
         lstrip_blocks=True,
     )
     environment.globals["asset"] = asset
-    environment.filters |= {"number": number, "signed": signed}
+    environment.filters |= {"number": number, "signed": signed_number}
     return environment
 
 
@@ -69,7 +69,7 @@ def script_json(value: object) -> Markup:
     return Markup(text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
 
 
-def packed(array: Shaped[np.ndarray, "..."]) -> dict[str, str]:
+def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, str]:
     """An array for the viewer: little-endian, compressed, in base64; its type is named as JavaScript does."""
     names = {"float32": "Float32Array", "uint32": "Uint32Array", "uint16": "Uint16Array", "int16": "Int16Array"}
     name = "Uint8Array" if array.dtype == np.uint8 else names[array.dtype.name]
@@ -108,7 +108,7 @@ def number(value: float | int | None, digits: int = 1) -> str:
     return "–" if value is None else f"{value:z,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 
 
-def signed(value: float | int | None, digits: int = 1) -> str:
+def signed_number(value: float | int | None, digits: int = 1) -> str:
     """As :func:`number`, with its sign."""
     return "–" if value is None else f"{value:+z,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from cuspid.model.panorama import FrameUse, Panorama
-from cuspid.report.pages.page import jpeg_uri, number, photo_uri, picture_uri, provenance, render_page, signed
+from cuspid.report.pages.page import jpeg_uri, number, photo_uri, picture_uri, provenance, render_page, signed_number
 from cuspid.storage import PanoramaResult, ScoreResult
 
 _WIDEST_PX = 2600
@@ -122,11 +122,11 @@ def _tiles(score: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         tiles += [
             ("geometric error, median", number(found["median_mm"], 2), "mm"),
             ("95 % within", number(found["p95_mm"], 2), "mm"),
-            ("scale error", signed(found["scale_error_pct"], 2), "%"),
+            ("scale error", signed_number(found["scale_error_pct"], 2), "%"),
             ("tilt of its occlusal plane", number(found["tilt_deg"], 1), "deg"),
             ("median seen along its own direction", number(found["own_median_mm"], 2), "mm"),
         ]
     if score["inter_molar_error_mm"] is not None:
-        tiles.append(("inter-molar error", signed(score["inter_molar_error_mm"], 2), "mm"))
+        tiles.append(("inter-molar error", signed_number(score["inter_molar_error_mm"], 2), "mm"))
     tiles.append(("share of the teeth shown", number(score["coverage_pct"], 1), "%"))
     return tiles

@@ -40,7 +40,7 @@ from cuspid.report.pages.scene import (
     standard_views,
     surface_maps,
 )
-from cuspid.report.pages.shown_mesh import ShownMesh, simplified
+from cuspid.report.pages.shown_mesh import ShownMesh, simplify
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Options, Range
 from cuspid.storage import ScanResult
@@ -83,8 +83,8 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
     scan = result.scan.transformed(shown_from_scan)
     range_um = options.range_um or deviation_range_um(result)
     worst = worst_places(scan, result.deviation_um, result.reference, options.worst)
-    shown = simplified(scan, options.max_faces)
-    maps = [(scale, shown.carried(values)) for scale, values in surface_maps(result, range_um)]
+    shown = simplify(scan, options.max_faces)
+    maps = [(scale, shown.at_vertices(values)) for scale, values in surface_maps(result, range_um)]
     scene, sizes = _scene(result, shown, maps, shown_from_scan, options)
     return render_page(
         "scan.html.j2",
@@ -136,7 +136,7 @@ def _scene(
     layers = [mesh_layer("scan", "Scan", shown.mesh, values_um={scale.name: values for scale, values in maps})]
     sizes = [_size("scan", shown.full_faces, len(shown.mesh.faces), shown.off_um)]
     if result.reference is not None:
-        truth = simplified(result.reference.mesh, options.max_reference_faces)
+        truth = simplify(result.reference.mesh, options.max_reference_faces)
         layers.append(
             mesh_layer("reference", "Reference", truth.mesh, visible=False, color=REFERENCE_COLOR, behind=True)
         )

@@ -13,7 +13,7 @@ from cuspid.model.trueness import METRICS
 from cuspid.report.figures.drawing import render
 from cuspid.report.figures.scanner_study import common_range_um
 from cuspid.report.pages.color_scale import deviation_scale
-from cuspid.report.pages.page import jpeg_uri, number, photo_uri, provenance, render_page, script_json, signed
+from cuspid.report.pages.page import jpeg_uri, number, photo_uri, provenance, render_page, script_json, signed_number
 from cuspid.report.pages.scene import mesh_layer, standard_views
 from cuspid.report.pages.shown_mesh import pack_um
 from cuspid.storage import ScannerStudyResult, SpecimenView
@@ -149,10 +149,10 @@ def _estimate(found: Mapping[str, Any] | None, digits: int = 1, *, plus: bool = 
     if found is None:
         return "–"
     digits += bool(digits) and abs(found["value"]) < _SMALL
-    told = (signed if plus else number)(found["value"], digits)
+    told = (signed_number if plus else number)(found["value"], digits)
     if found["low"] is None:
         return told
-    show = signed if plus else number
+    show = signed_number if plus else number
     return f"{told} ({show(found['low'], digits)} to {show(found['high'], digits)})"
 
 
@@ -160,7 +160,7 @@ def _size(value: float | None) -> str:
     return number(value, 2 if value is not None and abs(value) < _SMALL else 1)
 
 
-def _signed(figure: str) -> bool:
+def _has_sign(figure: str) -> bool:
     return figure in ("signed_mean_um", "scale_ppm", "similarity_scale_ppm", "spread_um", "lift_um", "twist_um")
 
 
@@ -208,7 +208,7 @@ def _modes_table(scanners: Mapping[str, Any]) -> Table:
         [
             name,
             *(
-                _estimate(found["trueness"][figure], 0 if "ppm" in figure else 1, plus=_signed(figure))
+                _estimate(found["trueness"][figure], 0 if "ppm" in figure else 1, plus=_has_sign(figure))
                 for figure in _MODES
             ),
         ]
@@ -230,10 +230,10 @@ def _spans_table(spans: Sequence[Mapping[str, Any]]) -> Table:
             row["scanner"],
             str(row["count"]),
             f"{number(row['from_mm'])} to {number(row['to_mm'])}",
-            signed(row["mean_um"]),
+            signed_number(row["mean_um"]),
             number(row["mean_abs_um"]),
             number(row["rms_um"]),
-            signed(row["slope_ppm"], 0),
+            signed_number(row["slope_ppm"], 0),
             number(row["angle_deg"], 3),
         ]
         for row in spans
@@ -274,7 +274,7 @@ def _factor_table(factor: str, levels: Mapping[str, Any]) -> Table:
         [
             level,
             str(next(each["scans"] for each in found.values() if each is not None)),
-            *(_estimate(found.get(name), 0 if "ppm" in name else 1, plus=_signed(name)) for name in figures),
+            *(_estimate(found.get(name), 0 if "ppm" in name else 1, plus=_has_sign(name)) for name in figures),
         ]
         for level, found in levels.items()
         if any(each is not None for each in found.values())

@@ -20,7 +20,7 @@ from cuspid.model.reconstruction import Reconstruction
 from cuspid.model.rig import Rig
 from cuspid.report.figures.drawing import fitting_range_um
 from cuspid.report.pages.color_scale import ColorScale, deviation_scale, sigma_scale
-from cuspid.report.pages.page import packed
+from cuspid.report.pages.page import pack_array
 from cuspid.report.pages.shown_mesh import pack_mesh, pack_um
 from cuspid.storage import ScanResult
 
@@ -131,7 +131,7 @@ def camera_layer(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> dict[str, An
         "name": "cameras",
         "label": "Cameras",
         "visible": False,
-        "points": packed(points.astype(np.float32)),
+        "points": pack_array(points.astype(np.float32)),
         "frames": list(rig_from_shown),
         "points_per_frame": len(points) // max(1, len(rig_from_shown)),
     }
@@ -163,7 +163,7 @@ def path_layer(rig: Rig, rig_from_shown: Mapping[str, Rigid3]) -> dict[str, Any]
         "name": "path",
         "label": "Path",
         "visible": False,
-        "points": packed(points.astype(np.float32)),
+        "points": pack_array(points.astype(np.float32)),
     }
 
 

@@ -11,9 +11,9 @@ from cuspid.model.shape_model import ShapeModel
 from cuspid.report.figures.drawing import render
 from cuspid.report.figures.shape import SHIFT_COLORS
 from cuspid.report.pages.color_scale import ColorScale
-from cuspid.report.pages.page import jpeg_uri, packed, picture_uri, provenance, render_page, script_json
+from cuspid.report.pages.page import jpeg_uri, pack_array, picture_uri, provenance, render_page, script_json
 from cuspid.report.pages.scene import mesh_layer, standard_views
-from cuspid.report.pages.shown_mesh import ShownMesh, simplified
+from cuspid.report.pages.shown_mesh import ShownMesh, simplify
 from cuspid.storage import ShapeResult
 
 _MOST_MODES = 5
@@ -25,7 +25,7 @@ _LARGEST = 32767
 def shape_page(result: ShapeResult, max_faces: int = 120_000) -> str:
     """The HTML of a shape model."""
     model = result.model
-    shown = simplified(model.mean.mesh, max_faces)
+    shown = simplify(model.mean.mesh, max_faces)
     count = min(_MOST_MODES, len(model.modes))
     shares = 100 * model.variance_shares
     scale = _scale(model)
@@ -78,7 +78,7 @@ def _mode(model: ShapeModel, k: int, nearest: np.ndarray) -> dict[str, Any]:
     """The displacement of each shown vertex for one standard deviation, in steps."""
     field = (model.standard_deviations_mm[k] * model.modes[k])[nearest]
     step = float(np.abs(field).max()) / _LARGEST or 1.0
-    return {"step": step, "field": packed(np.rint(field / step).astype(np.int16))}
+    return {"step": step, "field": pack_array(np.rint(field / step).astype(np.int16))}
 
 
 def _scale(model: ShapeModel) -> ColorScale:

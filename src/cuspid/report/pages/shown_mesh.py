@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from cuspid.model.mesh import Mesh
-from cuspid.report.pages.page import packed
+from cuspid.report.pages.page import pack_array
 
 _MOST = 65535
 _PROBES = 50_000
@@ -38,12 +38,12 @@ class ShownMesh:
     off_um: float
     """95 % of the vertices of the full mesh lie within this distance of it."""
 
-    def carried(self, values: Float[np.ndarray, "f"]) -> Float[np.ndarray, "v"]:
+    def at_vertices(self, values: Float[np.ndarray, "f"]) -> Float[np.ndarray, "v"]:
         """Values of the vertices of the full mesh, at these."""
         return values[self.nearest]
 
 
-def simplified(mesh: Mesh, max_faces: int) -> ShownMesh:
+def simplify(mesh: Mesh, max_faces: int) -> ShownMesh:
     """A mesh with at most ``max_faces`` faces."""
     full = len(mesh.faces)
     if full <= max_faces:
@@ -63,8 +63,8 @@ def pack_mesh(mesh: Mesh) -> dict[str, Any]:
     return {
         "origin": origin,
         "step": step,
-        "vertices": packed(np.rint((mesh.vertices - origin) / step).astype(np.uint16)),
-        "faces": packed(mesh.faces.astype(np.uint32)),
+        "vertices": pack_array(np.rint((mesh.vertices - origin) / step).astype(np.uint16)),
+        "faces": pack_array(mesh.faces.astype(np.uint32)),
     }
 
 
@@ -72,4 +72,4 @@ def pack_um(values_um: Float[np.ndarray, "v"]) -> dict[str, str]:
     """Values of vertices in steps of `UM_PER_STEP`; NaN is not known."""
     limit = -UNKNOWN - 1
     steps = np.clip(np.rint(np.nan_to_num(values_um) / UM_PER_STEP), -limit, limit)
-    return packed(np.where(np.isnan(values_um), UNKNOWN, steps).astype(np.int16))
+    return pack_array(np.where(np.isnan(values_um), UNKNOWN, steps).astype(np.int16))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from cuspid.geometry import Rigid3, composed
+from cuspid.geometry import Rigid3, compose_motions
 from cuspid.model.arch_curve import ArchCurve
 from cuspid.model.jaw import GUM, Jaw
 from cuspid.model.rig import Handpiece
@@ -63,8 +63,8 @@ class CrownPoints:
         seen = np.empty((len(pose_from_rig), len(which)), dtype=np.bool_)
         _seen_by_two(
             *(self.points[which], self.normals[which], self.open[which], self.nearest),
-            composed(pose_from_rig, rig_from_world),
-            composed([each.cam_from_rig for each in cameras], Rigid3.identity()),
+            compose_motions(pose_from_rig, rig_from_world),
+            compose_motions([each.cam_from_rig for each in cameras], Rigid3.identity()),
             np.array([np.concatenate(slope_bounds(each.camera)) for each in cameras]),
             np.array(handpiece.depth_range_mm),
             seen,

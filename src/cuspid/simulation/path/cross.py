@@ -24,7 +24,7 @@ from cuspid.model.arch_curve import ArchCurve
 from cuspid.model.mesh import Mesh
 from cuspid.model.rig import Handpiece
 from cuspid.model.room import Room
-from cuspid.simulation.path.detour import eased, least_lifts, up
+from cuspid.simulation.path.detour import ease_lifts, least_lifts, lifted_from_rig
 from cuspid.simulation.path.overlap import image_overlap
 
 _STEP_MM = 1.0
@@ -61,13 +61,13 @@ class Crossing:
     """Length of the way between them; initially of the straight one."""
     rig_from_world: tuple[Rigid3, ...]
 
-    def after(self, pose: Rigid3) -> Crossing:
+    def preceded_by(self, pose: Rigid3) -> Crossing:
         """The sweep after a pose of a pass over the place where it begins."""
         step = self.length_mm / (len(self.rig_from_world) - 1)
         poses = (pose, *self.rig_from_world)
         return replace(self, length_mm=self.length_mm + step, rig_from_world=poses)
 
-    def at(self, travel_mm: float) -> Rigid3:
+    def pose_at(self, travel_mm: float) -> Rigid3:
         """The handpiece after this travel along the sweep."""
         place = np.clip(travel_mm / self.length_mm, 0, 1) * (len(self.rig_from_world) - 1)
         before = min(int(place), len(self.rig_from_world) - 2)
@@ -111,7 +111,9 @@ def _crossing(mesh: Mesh, room: Room, curve: ArchCurve, start_mm: float, end_mm:
     lifts = least_lifts(room, poses)
     if not np.isfinite(lifts).all():
         return None
-    lifted = tuple(up(float(lift)) @ pose for lift, pose in zip(eased(lifts, _SLOPE), poses, strict=True))
+    lifted = tuple(
+        lifted_from_rig(float(lift)) @ pose for lift, pose in zip(ease_lifts(lifts, _SLOPE), poses, strict=True)
+    )
     return Crossing(start_mm, end_mm, length, lifted)
 
 

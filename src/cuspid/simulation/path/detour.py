@@ -77,7 +77,7 @@ class Detour:
         """Largest amount of each."""
         return np.abs(self.changes).max(axis=0)
 
-    def at(self, travel_mm: float) -> Rigid3:
+    def changed_from_rig(self, travel_mm: float) -> Rigid3:
         """``changed_rig_from_rig``."""
         return _motion(np.array([np.interp(travel_mm, self.travel_mm, column) for column in self.changes.T]))
 
@@ -145,7 +145,7 @@ def plan_detour(
     return Detour(travel_mm=travel, changes=_changes(poses, blocked, choose))
 
 
-def repaired(room: Room, rig_from_world: Sequence[Rigid3]) -> list[Rigid3]:
+def repair_path(room: Room, rig_from_world: Sequence[Rigid3]) -> list[Rigid3]:
     """Consecutive frames, those that do not fit and some before and after them changed by as little as is needed."""
     blocked = ~room.fits_at(rig_from_world)
     if not blocked.any():
@@ -255,17 +255,17 @@ def _shortest(stations: Sequence[_Choice], anchored: tuple[bool, bool]) -> Float
     return np.array(chosen[anchored[0] : len(chosen) - anchored[1]])
 
 
-def lifted(room: Room, pose_at: PoseAt, span_mm: tuple[float, float]) -> PoseAt:
+def lift_path(room: Room, pose_at: PoseAt, span_mm: tuple[float, float]) -> PoseAt:
     """The path of a hand that lifts the handpiece where it would touch, as far as that helps."""
     travel = np.linspace(*span_mm, max(2, 1 + round(2 * (span_mm[1] - span_mm[0]) / _STATION_MM)))
     reach = round(_SLOPE_MM / (travel[1] - travel[0]))
-    lifts = eased(least_lifts(room, [pose_at(float(at)) for at in travel]), reach)
+    lifts = ease_lifts(least_lifts(room, [pose_at(float(at)) for at in travel]), reach)
     if not lifts.any():
         return pose_at
-    return lambda at: up(float(np.interp(at, travel, lifts))) @ pose_at(at)
+    return lambda at: lifted_from_rig(float(np.interp(at, travel, lifts))) @ pose_at(at)
 
 
-def up(lift_mm: float) -> Rigid3:
+def lifted_from_rig(lift_mm: float) -> Rigid3:
     """``lifted_rig_from_rig``: away from what the handpiece looks at."""
     return Rigid3(np.eye(3), np.array([0, 0, -lift_mm]))
 
@@ -274,12 +274,12 @@ def least_lifts(room: Room, rig_from_world: Sequence[Rigid3]) -> Float[np.ndarra
     """How much each pose must be lifted to fit, mm; infinite where that does not help."""
     lifts = np.zeros(len(rig_from_world))
     for index in np.flatnonzero(~room.fits_at(rig_from_world)).tolist():
-        fits = room.fits(rig_from_world[index], [up(float(height)) for height in _HEIGHTS_MM])
+        fits = room.fits(rig_from_world[index], [lifted_from_rig(float(height)) for height in _HEIGHTS_MM])
         lifts[index] = _HEIGHTS_MM[np.argmax(fits)] + _SPARE_MM if fits.any() else np.inf
     return lifts
 
 
-def eased(lifts_mm: Float[np.ndarray, "n"], reach: int) -> Float[np.ndarray, "n"]:
+def ease_lifts(lifts_mm: Float[np.ndarray, "n"], reach: int) -> Float[np.ndarray, "n"]:
     """Lifts of consecutive poses, rising and falling over ``reach`` poses; none for those that do not help."""
     helpful = np.where(np.isfinite(lifts_mm), lifts_mm, 0.0)
     if not helpful.any():

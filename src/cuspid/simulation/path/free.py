@@ -27,7 +27,7 @@ from cuspid.model.room import Room, room_about
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import SHARE, Options, Range
 from cuspid.simulation.path.cross import plan_crossing
-from cuspid.simulation.path.detour import eased, least_lifts, repaired, up
+from cuspid.simulation.path.detour import ease_lifts, least_lifts, lifted_from_rig, repair_path
 
 _LOG = logging.getLogger("cuspid")
 
@@ -101,10 +101,10 @@ def plan_free_path(
         Rigid3.from_rotation_vector(motion[:3], motion[3:]) @ steady(float(travel))
         for motion, travel in zip(motions, along / along[-1] * length_mm, strict=True)
     ]
-    lifts = eased(least_lifts(room, poses), reach)
+    lifts = ease_lifts(least_lifts(room, poses), reach)
     if lifts.any():
         _LOG.info(f"free path: the hand lifts the camera by up to {lifts.max():.1f} mm where it would come too close")
-    poses = repaired(room, [up(lift) @ pose for lift, pose in zip(lifts.tolist(), poses, strict=True)])
+    poses = repair_path(room, [lifted_from_rig(lift) @ pose for lift, pose in zip(lifts.tolist(), poses, strict=True)])
     return {f"{index:05d}": pose for index, pose in enumerate(poses)}
 
 
@@ -143,12 +143,12 @@ def _plan_across(
             "all the way; choose return or s-shape"
         )
     begins = 2 * length - crossing.start_mm
-    crossing = crossing.after(curve.rig_from_world(crossing.start_mm))
+    crossing = crossing.preceded_by(curve.rig_from_world(crossing.start_mm))
 
-    def at(travel_mm: float) -> Rigid3:
-        return there_and_back(travel_mm) if travel_mm <= begins else crossing.at(travel_mm - begins)
+    def pose_at(travel_mm: float) -> Rigid3:
+        return there_and_back(travel_mm) if travel_mm <= begins else crossing.pose_at(travel_mm - begins)
 
-    return begins + crossing.length_mm, at
+    return begins + crossing.length_mm, pose_at
 
 
 def hand_noise(options: FreePathOptions, channels: int, rng: np.random.Generator) -> Float[np.ndarray, "f c"]:

@@ -19,7 +19,7 @@ from cuspid.model.mesh import Mesh
 from cuspid.model.rig import Handpiece
 from cuspid.model.room import Room
 from cuspid.simulation.path.coverage import CrownPoints
-from cuspid.simulation.path.detour import up
+from cuspid.simulation.path.detour import lifted_from_rig
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path
 
 _ROLLS_DEG = (-90.0, -60.0, -45.0, -30.0, 30.0, 45.0, 60.0, 90.0)
@@ -169,7 +169,7 @@ def _stations(path: SteadyPath) -> Iterator[Rigid3]:
 
 def _least_lifted(room: Room, pose: Rigid3) -> Rigid3 | None:
     """The pose, lifted by as little as is needed to fit; None where none of the lifts does."""
-    lifts = [up(lift) for lift in _LIFTS_MM]
+    lifts = [lifted_from_rig(lift) for lift in _LIFTS_MM]
     fits = room.fits(pose, lifts)
     return lifts[int(np.argmax(fits))] @ pose if fits.any() else None
 

@@ -20,7 +20,7 @@ class HandMotion:
     drift: Float[np.ndarray, "n 6"]
     """Rotation vector (rad) and translation (mm) at those places."""
 
-    def at(self, travel_mm: float) -> Rigid3:
+    def jittered_from_rig(self, travel_mm: float) -> Rigid3:
         """``jittered_rig_from_rig`` at a place on the path."""
         drift = np.array([np.interp(travel_mm, self.travel_mm, column) for column in self.drift.T])
         return Rigid3.from_rotation_vector(drift[:3], drift[3:])

@@ -96,7 +96,7 @@ class SteadyPath:
     def rig_from_world(self, travel_mm: float) -> Rigid3:
         """The handpiece without the drift of a hand."""
         if self.crossing is not None and travel_mm > self.legs_end_mm:
-            return self.crossing.at(travel_mm - self.legs_end_mm)
+            return self.crossing.pose_at(travel_mm - self.legs_end_mm)
         length, roll = self.place(travel_mm)
         sink = float(np.interp(length, self.stations_mm, self.sinks_mm))
         hold_from_world = _hold_from_world(self.curve, length, sink)

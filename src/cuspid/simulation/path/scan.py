@@ -30,7 +30,7 @@ from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import TOOTH, Options, Range
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.cross import plan_crossing
-from cuspid.simulation.path.detour import Detour, PoseAt, lifted, plan_detour, repaired
+from cuspid.simulation.path.detour import Detour, PoseAt, lift_path, plan_detour, repair_path
 from cuspid.simulation.path.further import further_legs, seen_from
 from cuspid.simulation.path.hand import HandMotion, hand_motion
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path, there_and_back
@@ -172,7 +172,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
         jitter_deg=options.jitter_deg,
         jitter_length_mm=options.jitter_length_mm,
     )
-    pose_at = lifted(room, _apply_drift(steady, detour, hand), steady.span_mm)
+    pose_at = lift_path(room, _apply_drift(steady, detour, hand), steady.span_mm)
     path = _with_frames(room, handpiece, first, steady, pose_at, options)
     if not np.isfinite(path.overlap).any():
         raise InputError(
@@ -235,7 +235,7 @@ def _cross(mesh: Mesh, room: Room, handpiece: Handpiece, steady: SteadyPath, opt
     before = crossing.start_mm + np.sign(ends_at - crossing.start_mm) * _LEAD_MM
     lead = Leg(roll_deg=0.0, start_mm=float(before), end_mm=crossing.start_mm)
     led = steady_path(mesh, steady.curve, (*steady.legs, lead))
-    return replace(led, crossing=crossing.after(led.rig_from_world(led.legs_end_mm)))
+    return replace(led, crossing=crossing.preceded_by(led.rig_from_world(led.legs_end_mm)))
 
 
 def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[float, float]:
@@ -258,8 +258,8 @@ def _reach_mm(handpiece: Handpiece) -> float:
 def _apply_drift(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
     """The trajectory of a hand that drifts."""
     if not detour.changes.any():
-        return lambda at: hand.at(at) @ steady.rig_from_world(at)
-    return lambda at: hand.at(at) @ detour.at(at) @ steady.rig_from_world(at)
+        return lambda at: hand.jittered_from_rig(at) @ steady.rig_from_world(at)
+    return lambda at: hand.jittered_from_rig(at) @ detour.changed_from_rig(at) @ steady.rig_from_world(at)
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
@@ -318,7 +318,7 @@ def _even_path(room: Room, handpiece: Handpiece, steady: SteadyPath, pose_at: Po
         lost = 1 - frame_overlap(image_overlap(mesh, handpiece, [pose_at(float(at)) for at in travel], _COARSE))
         change = np.concatenate([[0], np.cumsum(np.maximum(lost, 0.25 * lost.max()))])
         travel = np.interp(np.linspace(0, change[-1], frames), change, travel)
-    poses = repaired(room, [pose_at(float(at)) for at in travel])
+    poses = repair_path(room, [pose_at(float(at)) for at in travel])
     return ScanPath(
         rig_from_world={f"{index:05d}": pose for index, pose in enumerate(poses)},
         overlap=image_overlap(mesh, handpiece, poses),

@@ -12,7 +12,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.rig import MountedCamera, Rig
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import checked_name, shown
+from cuspid.runtime.values import checked_name, quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints
 from cuspid.storage.calibrations.lenses import ALL, Lens
@@ -89,7 +89,7 @@ def read_model(files: Mapping[str, Document], hints: Hints) -> Calibration:
     for row in _image_rows(files["images"]):
         name = checked_name("images.txt", str(PurePosixPath(row[9]).with_suffix("")))
         if row[8] not in lenses:
-            raise InputError(f"images.txt: {shown(row[9])} has the camera {shown(row[8])}, which cameras.txt lacks")
+            raise InputError(f"images.txt: {quote(row[9])} has the camera {quote(row[8])}, which cameras.txt lacks")
         w, x, y, z, *shift = (float(each) for each in row[1:8])
         cameras[name] = MountedCamera(
             lenses[row[8]], rigid_from_json({"rotation_wxyz": [w, x, y, z], "translation_mm": shift}, name)

@@ -15,7 +15,7 @@ from cuspid.geometry.cameras import MODELS
 from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.model.rig import MountedCamera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import LONGEST_MM, MOST_PX, number, numbers, shown, whole
+from cuspid.runtime.values import LONGEST_MM, MOST_PX, number, numbers, quote, whole
 from cuspid.storage.calibrations.lenses import Loss
 from cuspid.storage.units import Unit
 
@@ -48,17 +48,17 @@ class Hints:
     """Of its images, where the file does not tell."""
 
 
-def listed(what: str, value: Any) -> list[Any]:
+def require_list(what: str, value: Any) -> list[Any]:
     """A list. Raises InputError for anything else."""
     if not isinstance(value, list):
-        raise InputError(f"{what} is {shown(value)}; it must be a list")
+        raise InputError(f"{what} is {quote(value)}; it must be a list")
     return value
 
 
-def mapped(what: str, value: Any) -> Mapping[str, Any]:
+def require_mapping(what: str, value: Any) -> Mapping[str, Any]:
     """A mapping with names as keys. Raises InputError for anything else."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
-        raise InputError(f"{what} is {shown(value)}; it must have named fields")
+        raise InputError(f"{what} is {quote(value)}; it must have named fields")
     return value
 
 
@@ -95,7 +95,7 @@ def nearest_rotation(what: str, found: Float[np.ndarray, "3 3"]) -> Float[np.nda
     """The rotation that a rounded matrix is meant to be. Raises InputError for what is none."""
     left, lengths, right = np.linalg.svd(found)
     if np.abs(lengths - 1).max() > _SKEWED or np.linalg.det(found) < 0:
-        raise InputError(f"{what} is {shown(found)}; it must be a rotation")
+        raise InputError(f"{what} is {quote(found)}; it must be a rotation")
     return np.asarray(left @ right)
 
 
@@ -154,7 +154,7 @@ def calibration_matrix(what: str, value: Any) -> tuple[list[float], list[float]]
     """Focal lengths and principal point of a matrix K. Raises InputError where it has skew."""
     found = matrix(what, value, 3, 3, _MOST_FOCAL_PX)
     if abs(found[0, 1]) > _NO_SKEW_PX or np.abs(found[[1, 2, 2], [0, 0, 1]]).max() > _NO_SKEW_PX:
-        raise InputError(f"{what} is {shown(found)}; it must be [fx 0 cx; 0 fy cy; 0 0 1], without skew")
+        raise InputError(f"{what} is {quote(found)}; it must be [fx 0 cx; 0 fy cy; 0 0 1], without skew")
     scale = number(f"{what}: its last number", found[2, 2], 1e-9, 1e9)
     found = found / scale
     return [found[0, 0], found[1, 1]], [found[0, 2], found[1, 2]]
@@ -166,7 +166,7 @@ def brown(coefficients: Float[np.ndarray, "n"]) -> tuple[str, list[float]]:
     return ("FULL_OPENCV", padded) if any(padded[4:]) else ("OPENCV", padded[:4])
 
 
-def scaled(mounted: MountedCamera, factor: float) -> MountedCamera:
+def scale_lengths(mounted: MountedCamera, factor: float) -> MountedCamera:
     """With its lengths in another unit."""
     shift = np.diag([1.0, 1, 1, factor, factor, factor])
     covariance = None if mounted.covariance is None else shift @ mounted.covariance @ shift

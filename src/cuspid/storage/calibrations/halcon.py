@@ -15,7 +15,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.rig import MountedCamera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import checked_name, number, shown
+from cuspid.runtime.values import checked_name, number, quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, vector
 from cuspid.storage.calibrations.lenses import Lens, Loss, of_projection
@@ -57,7 +57,7 @@ def _pose(text: str) -> Rigid3:
     """HALCON's usual pose, type 0: turned by R_x(a) R_y(b) R_z(c), degrees."""
     told = dict(_POSE.findall(text))
     if told["f"].strip() != "0":
-        raise InputError(f"its pose has the type {shown(told['f'])}; convert it to type 0 (convert_pose_type)")
+        raise InputError(f"its pose has the type {quote(told['f'])}; convert it to type 0 (convert_pose_type)")
     angles, shift = (vector("pose", [float(word) for word in told[each].split()], 3) for each in ("r", "t"))
     return Rigid3(Rotation.from_euler("XYZ", angles, degrees=True).as_matrix(), shift)
 

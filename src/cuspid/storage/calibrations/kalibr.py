@@ -15,9 +15,9 @@ from cuspid.geometry.cameras import MODELS
 from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.model.rig import MountedCamera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import checked_name, shown
+from cuspid.runtime.values import checked_name, quote
 from cuspid.storage.calibrations.documents import Document
-from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, mapped, motion, vector
+from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, motion, require_mapping, vector
 from cuspid.storage.calibrations.lenses import BROWN_4, FISHEYE, Lens, Loss, of_projection
 
 LENSES: tuple[Lens, ...] = (BROWN_4, FISHEYE)
@@ -40,8 +40,8 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     cameras: dict[str, MountedCamera] = {}
     losses: dict[str, Loss] = {}
     place = Rigid3.identity()
-    for key, value in mapped("a camera chain", document.value).items():
-        entry = mapped(key, value)
+    for key, value in require_mapping("a camera chain", document.value).items():
+        entry = require_mapping(key, value)
         name = checked_name("camera", key)
         if cameras:
             place = motion(f"{name}: T_cn_cnm1", entry["T_cn_cnm1"]) @ place
@@ -55,7 +55,7 @@ def _camera(name: str, entry: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
     model, distortion = entry["camera_model"], entry.get("distortion_model", "none")
     if model not in _EXTRA or distortion not in _COEFFICIENTS:
         raise InputError(
-            f"{name}: camera_model {shown(model)} with distortion_model {shown(distortion)} is not known; models are "
+            f"{name}: camera_model {quote(model)} with distortion_model {quote(distortion)} is not known; models are "
             f"{', '.join(_EXTRA)}, distortions {', '.join(_COEFFICIENTS)}"
         )
     intrinsics = vector(f"{name}: intrinsics", entry["intrinsics"], _EXTRA[model] + 4)
@@ -69,7 +69,7 @@ def _camera(name: str, entry: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
         values = np.pad(coefficients, (0, len(MODELS[exact].names) - len(coefficients)))
         return camera(name, size, focal, centre, values, exact), None
     if np.any(focal < 1):
-        raise InputError(f"{name}: intrinsics are {shown(intrinsics)}; focal lengths must be at least 1 px")
+        raise InputError(f"{name}: intrinsics are {quote(intrinsics)}; focal lengths must be at least 1 px")
 
     def project(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         with np.errstate(all="ignore"):

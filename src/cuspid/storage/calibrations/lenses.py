@@ -46,7 +46,7 @@ class Lens:
         alike = camera.lens.is_equidistant == MODELS[self.model].is_equidistant
         return used <= set(self.names) and alike
 
-    def of(self, camera: Camera) -> Camera:
+    def as_model(self, camera: Camera) -> Camera:
         """The same camera in this model, whose covariance is lost unless the model is the same."""
         if camera.model == self.model:
             return camera
@@ -86,11 +86,11 @@ class Loss:
         return f"{self.said}: at most {self.largest_px:.2g} px off over the image, RMS {self.rms_px:.2g} px"
 
 
-def carried(camera: Camera, lenses: Sequence[Lens]) -> tuple[Camera, Loss | None]:
+def convert_lens(camera: Camera, lenses: Sequence[Lens]) -> tuple[Camera, Loss | None]:
     """A camera with a lens that one of the given ones holds: the same, or the nearest with what is lost."""
     for lens in lenses:
         if lens.holds(camera):
-            return lens.of(camera), None
+            return lens.as_model(camera), None
     pixels = _grid(camera)
     directions = camera.directions(pixels)
     seen = np.isfinite(directions).all(axis=1)

@@ -14,7 +14,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.rig import MountedCamera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import shown
+from cuspid.runtime.values import quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import (
     Calibration,
@@ -24,9 +24,9 @@ from cuspid.storage.calibrations.fields import (
     calibration_matrix,
     camera,
     image_size,
-    mapped,
     matrix,
     nearest_rotation,
+    require_mapping,
     vector,
 )
 from cuspid.storage.calibrations.lenses import BROWN_5, Lens
@@ -62,7 +62,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
             unit=_unit(values),
             notes=(note,) if note else (),
         )
-    both = [mapped(key, values[key]) for key in ("CameraParameters1", "CameraParameters2")]
+    both = [require_mapping(key, values[key]) for key in ("CameraParameters1", "CameraParameters2")]
     found = [_camera(f"CameraParameters{index}", each, hints) for index, each in enumerate(both, start=1)]
     return Calibration(
         cameras={
@@ -84,7 +84,7 @@ def _second_from_first(values: Mapping[str, Any]) -> Rigid3:
         turn = matrix("RotationOfCamera2", values["RotationOfCamera2"], 3, 3).T
         shift = vector("TranslationOfCamera2", values["TranslationOfCamera2"], 3)
     else:
-        told = mapped("PoseCamera2", values["PoseCamera2"])
+        told = require_mapping("PoseCamera2", values["PoseCamera2"])
         if "A" in told:
             whole = matrix("PoseCamera2", told["A"], 4, 4)
             turn, shift = whole[:3, :3], whole[:3, 3]
@@ -99,7 +99,7 @@ def _camera(what: str, values: Mapping[str, Any], hints: Hints) -> tuple[Camera,
     else:
         found = matrix(f"{what}: IntrinsicMatrix", values["IntrinsicMatrix"], 3, 3, 1e7)
         if abs(found[1, 0]) > 1e-6:
-            raise InputError(f"{what}: IntrinsicMatrix is {shown(found)}; calibrate without skew")
+            raise InputError(f"{what}: IntrinsicMatrix is {quote(found)}; calibrate without skew")
         focal, centre = calibration_matrix(f"{what}: IntrinsicMatrix", found.T.tolist())
     told, note = values.get("ImageSize"), None
     if told:

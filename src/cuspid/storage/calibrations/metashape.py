@@ -15,7 +15,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.rig import MountedCamera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import checked_name, number, shown
+from cuspid.runtime.values import checked_name, number, quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, motion
 from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE_TANGENTIAL, Lens, Loss, of_projection
@@ -54,7 +54,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
             name = checked_name("camera", f"{name}-{element.get('id')}")
         sensor = element.get("sensor_id")
         if sensor not in sensors:
-            raise InputError(f"camera {name}: it has no sensor {shown(sensor)}")
+            raise InputError(f"camera {name}: it has no sensor {quote(sensor)}")
         if sensor not in known:
             known[sensor] = _camera(f"sensor {sensor}", sensors[sensor])
         made, loss = known[sensor]
@@ -109,7 +109,7 @@ def _camera(what: str, sensor: Element) -> tuple[Camera, Loss | None]:
     )
     kind = calibration.get("type", sensor.get("type", "frame"))
     if kind not in ("frame", "fisheye"):
-        raise InputError(f"{what}: type {shown(kind)} is not supported; only frame and fisheye are")
+        raise InputError(f"{what}: type {quote(kind)} is not supported; only frame and fisheye are")
     focal_px, centre = [f + b1, f], [size[0] / 2 + cx, size[1] / 2 + cy]
     if kind == "fisheye":
         model, values = "THIN_PRISM_FISHEYE", [k1, k2, p2, p1, k3, k4, 0.0, 0.0]

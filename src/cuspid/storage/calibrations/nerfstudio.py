@@ -14,9 +14,17 @@ from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.rig import MountedCamera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import checked_name, number, shown
+from cuspid.runtime.values import checked_name, number, quote
 from cuspid.storage.calibrations.documents import Document
-from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, listed, mapped, motion
+from cuspid.storage.calibrations.fields import (
+    Calibration,
+    Hints,
+    camera,
+    image_size,
+    motion,
+    require_list,
+    require_mapping,
+)
 from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, Lens, Loss, of_projection
 
 LENSES: tuple[Lens, ...] = (BROWN_5, FISHEYE)
@@ -35,7 +43,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     """A camera for each frame, named after its image. Raises InputError."""
     (document,) = files.values()
     shared = {key: value for key, value in document.value.items() if key != "frames"}
-    frames = [mapped("a frame", each) for each in listed("frames", document.value["frames"])]
+    frames = [require_mapping("a frame", each) for each in require_list("frames", document.value["frames"])]
     paths = [PurePosixPath(str(each.get("file_path", index)).replace("\\", "/")) for index, each in enumerate(frames)]
     names = _names(paths)
     cameras: dict[str, MountedCamera] = {}
@@ -84,7 +92,7 @@ def _camera(what: str, told: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
     centre = [told.get("cx", width / 2), told.get("cy", height / 2)]
     model = told.get("camera_model", "OPENCV")
     if model not in _MODELS:
-        raise InputError(f"{what}: camera_model {shown(model)} is not supported; use one of {', '.join(_MODELS)}")
+        raise InputError(f"{what}: camera_model {quote(model)} is not supported; use one of {', '.join(_MODELS)}")
     names = ("k1", "k2", "k3", "k4", "p1", "p2")
     k1, k2, k3, k4, p1, p2 = (number(f"{what}: {each}", told.get(each, 0.0), -_MOST, _MOST) for each in names)
     if model == "OPENCV_FISHEYE":

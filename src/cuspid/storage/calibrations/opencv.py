@@ -26,9 +26,9 @@ from cuspid.storage.calibrations.fields import (
     calibration_matrix,
     camera,
     image_size,
-    listed,
-    mapped,
     pose,
+    require_list,
+    require_mapping,
     vector,
 )
 from cuspid.storage.calibrations.lenses import FISHEYE, RATIONAL, Lens, Loss, of_projection
@@ -76,8 +76,8 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
 
     if _several(values):
         cameras = {}
-        for each in listed("cameras", values["cameras"]):
-            entry = mapped("a camera", each)
+        for each in require_list("cameras", values["cameras"]):
+            entry = require_mapping("a camera", each)
             name = checked_name("name", entry["name"])
             placed = pose(f"camera {name}: R and T", entry["R"], entry["T"])
             cameras[name] = MountedCamera(camera_of(name, _single(entry)), placed)
@@ -109,7 +109,7 @@ def _merge_files(files: Mapping[str, Document]) -> Mapping[str, Any]:
     merged: dict[str, Any] = {}
     for document in files.values():
         values = _of_xml(document.value) if document.kind == "xml" else document.value
-        merged.update(mapped("an OpenCV calibration", values))
+        merged.update(require_mapping("an OpenCV calibration", values))
     return merged
 
 

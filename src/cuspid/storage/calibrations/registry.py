@@ -15,9 +15,9 @@ from cuspid.runtime.errors import InputError, OutputError
 from cuspid.runtime.inputs import read_text
 from cuspid.storage.calibrations import colmap, halcon, kalibr, matlab, metashape, nerfstudio, opencv, ros, tables
 from cuspid.storage.calibrations.documents import Document, parse
-from cuspid.storage.calibrations.fields import Calibration, Hints, scaled
-from cuspid.storage.calibrations.lenses import SPLINED, Lens, Loss, carried
-from cuspid.storage.files import finished, reading, whole_files, write_bytes
+from cuspid.storage.calibrations.fields import Calibration, Hints, scale_lengths
+from cuspid.storage.calibrations.lenses import SPLINED, Lens, Loss, convert_lens
+from cuspid.storage.files import list_finished, reading, whole_files, write_bytes
 from cuspid.storage.handpieces import handpiece_of_rig, write_handpiece
 from cuspid.storage.units import MM_PER_UNIT, Unit
 
@@ -130,14 +130,14 @@ def read_calibration(
         name = kind or _recognise(files)
         found = FORMATS[name].read(files, Hints(image_size_px=image_size_px))
         told, note = _unit(FORMATS[name], found, unit)
-        rig = Rig({each: scaled(mounted, MM_PER_UNIT[told]) for each, mounted in found.cameras.items()})
+        rig = Rig({each: scale_lengths(mounted, MM_PER_UNIT[told]) for each, mounted in found.cameras.items()})
     return ReadCalibration(rig=rig, format=name, losses=found.losses, notes=found.notes + note)
 
 
 def _documents(path: Path) -> Mapping[str, Document]:
     paths = [path]
     if path.is_dir():
-        paths = sorted(each for each in finished(path) if each.suffix.lower() in _SUFFIXES and each.is_file())
+        paths = sorted(each for each in list_finished(path) if each.suffix.lower() in _SUFFIXES and each.is_file())
         if not 0 < len(paths) <= _MOST_FILES:
             raise InputError(f"{path}: {len(paths)} files may be calibrations; give the file, or a folder of few")
     documents = {}
@@ -207,7 +207,7 @@ def carried_over(rig: Rig, kind: Name) -> CarriedOver:
     count = len(rig.names)
     if format.max_cameras is not None and count > format.max_cameras:
         raise OutputError(f"{format.title} holds {format.max_cameras} cameras at most, not {count}; give another --to")
-    lenses = {name: carried(mounted.camera, format.lenses) for name, mounted in rig.cameras.items()}
+    lenses = {name: convert_lens(mounted.camera, format.lenses) for name, mounted in rig.cameras.items()}
     cameras = {name: replace(mounted, camera=lenses[name][0]) for name, mounted in rig.cameras.items()}
     notes = []
     if kind != "handpiece" and any(_is_uncertain(each) for each in rig.cameras.values()):
@@ -234,7 +234,7 @@ def write_calibration(path: Path, rig: Rig, kind: Name, working_distance_mm: flo
     format = FORMATS[kind]
     if format.write is None:
         raise OutputError(f"{path}: {format.title} is only read; give another format")
-    cameras = {name: scaled(each, 1 / MM_PER_UNIT[format.unit or "mm"]) for name, each in rig.cameras.items()}
+    cameras = {name: scale_lengths(each, 1 / MM_PER_UNIT[format.unit or "mm"]) for name, each in rig.cameras.items()}
     text = format.write(cameras, path.suffix.lower())
     if isinstance(text, str):
         write_bytes(path, text.encode())

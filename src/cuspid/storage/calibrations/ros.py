@@ -15,7 +15,7 @@ from jaxtyping import Float
 from cuspid.geometry import Rigid3
 from cuspid.model.rig import MountedCamera
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.values import checked_name, shown
+from cuspid.runtime.values import checked_name, quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import (
     Calibration,
@@ -24,9 +24,9 @@ from cuspid.storage.calibrations.fields import (
     calibration_matrix,
     camera,
     image_size,
-    mapped,
     matrix,
     nearest_rotation,
+    require_mapping,
     vector,
 )
 from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, RATIONAL, Lens
@@ -55,7 +55,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     cameras: dict[str, MountedCamera] = {}
     placed: list[str] = []
     for stem, document in files.items():
-        values = mapped("a camera_info", document.value)
+        values = require_mapping("a camera_info", document.value)
         name = checked_name("camera_name", values.get("camera_name") or stem)
         if name in cameras:
             name = checked_name("camera", stem)
@@ -87,7 +87,7 @@ def _mount_camera(what: str, values: Mapping[str, Any]) -> tuple[MountedCamera, 
         model, parameters = brown(distortion)
     else:
         raise InputError(
-            f"{what}: distortion_model {shown(kind)} with {len(distortion)} coefficients is not known; use plumb_bob "
+            f"{what}: distortion_model {quote(kind)} with {len(distortion)} coefficients is not known; use plumb_bob "
             "(5), rational_polynomial (8) or equidistant (4)"
         )
     turn, projection = field_of("rectification_matrix", "R", "r"), field_of("projection_matrix", "P", "p")
@@ -106,7 +106,7 @@ def _shift(what: str, projection: Float[np.ndarray, "3 4"]) -> Float[np.ndarray,
     if not projection[:, 3].any():
         return np.zeros(3)
     if not (projection[0, 0] > 0 and projection[1, 1] > 0):
-        raise InputError(f"{what} is {shown(projection)}; its focal lengths must be positive")
+        raise InputError(f"{what} is {quote(projection)}; its focal lengths must be positive")
     return np.array([projection[0, 3] / projection[0, 0], projection[1, 3] / projection[1, 1], 0.0])
 
 

@@ -21,8 +21,8 @@ from cuspid.storage.calibrations.fields import (
     calibration_matrix,
     camera,
     image_size,
-    mapped,
     pose,
+    require_mapping,
     vector,
 )
 from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, Lens
@@ -73,7 +73,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
 
 
 def _mount_camera(what: str, table: Mapping[str, Any]) -> MountedCamera:
-    table = mapped(what, table)
+    table = require_mapping(what, table)
     size = image_size(what, *vector(f"{what}: size", table["size"], 2).tolist())
     focal, centre = calibration_matrix(f"{what}: matrix", table["matrix"])
     given = vector(f"{what}: distortions", table.get("distortions", []))

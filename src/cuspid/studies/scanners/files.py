@@ -19,7 +19,7 @@ from cuspid import storage
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import is_there
 from cuspid.storage import MARKUPS_SUFFIX, MESH_SUFFIXES
-from cuspid.storage.files import finished
+from cuspid.storage.files import list_finished
 
 REFERENCE = "reference"
 """Name of the folder of references."""
@@ -95,7 +95,7 @@ class StudyFiles:
     remarks: tuple[Remark, ...] = ()
     """What is odd about them."""
 
-    def of(self, specimen: str) -> tuple[ScanFile, ...]:
+    def scans_of(self, specimen: str) -> tuple[ScanFile, ...]:
         """The scans of a specimen."""
         return tuple(scan for scan in self.scans if scan.specimen == specimen)
 
@@ -123,7 +123,7 @@ def without_repeats(files: StudyFiles, digests: Mapping[str, str]) -> StudyFiles
     return StudyFiles(scans=tuple(kept), references=files.references, remarks=(*files.remarks, *remarks))
 
 
-def beside(reference: Path, endings: Sequence[str]) -> Path | None:
+def find_beside(reference: Path, endings: Sequence[str]) -> Path | None:
     """The first file that is named after a reference with one of the endings; None where there is none."""
     paths = (reference.with_name(reference.stem + ending) for ending in endings)
     return next((path for path in paths if is_there(path)), None)
@@ -131,25 +131,27 @@ def beside(reference: Path, endings: Sequence[str]) -> Path | None:
 
 def area_file(reference: Path) -> Path | None:
     """The mesh of the reference area of a specimen."""
-    return beside(reference, [f".area{suffix}" for suffix in MESH_SUFFIXES])
+    return find_beside(reference, [f".area{suffix}" for suffix in MESH_SUFFIXES])
 
 
 def body_file(reference: Path) -> Path | None:
     """The library mesh of the scan bodies of a specimen."""
-    own = beside(reference, [f".scanbody{suffix}" for suffix in MESH_SUFFIXES])
+    own = find_beside(reference, [f".scanbody{suffix}" for suffix in MESH_SUFFIXES])
     common = (reference.with_name(f"{_COMMON_BODY}{suffix}") for suffix in MESH_SUFFIXES)
     return own or next((path for path in common if is_there(path)), None)
 
 
 def landmark_file(mesh: Path) -> Path | None:
     """The landmarks of a scan or a reference."""
-    return beside(mesh, (".landmarks.json", MARKUPS_SUFFIX))
+    return find_beside(mesh, (".landmarks.json", MARKUPS_SUFFIX))
 
 
 def belongings(reference: Path) -> tuple[Path, ...]:
     """All files that tell what a specimen is, the reference first."""
     others = (area_file(reference), body_file(reference), landmark_file(reference))
-    tables = (beside(reference, [ending]) for ending in (".spheres.csv", ".bodies.csv", "_facelabels.npy", ".json"))
+    tables = (
+        find_beside(reference, [ending]) for ending in (".spheres.csv", ".bodies.csv", "_facelabels.npy", ".json")
+    )
     return (reference, *(path for path in (*others, *tables) if path is not None))
 
 
@@ -159,7 +161,7 @@ def belongings(reference: Path) -> tuple[Path, ...]:
 def _from_folder(folder: Path) -> StudyFiles:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give FOLDER/<scanner>/<specimen>/<scan>.stl, or a CSV manifest")
-    home = next((path for path in finished(folder) if path.is_dir() and path.name.lower() == REFERENCE), None)
+    home = next((path for path in list_finished(folder) if path.is_dir() and path.name.lower() == REFERENCE), None)
     if home is None:
         raise InputError(f"{folder}: has no folder '{REFERENCE}' with a mesh of each specimen, <specimen>.stl")
     references = {path.stem: path for path in _meshes(home) if not _goes_along(path)}
@@ -167,7 +169,7 @@ def _from_folder(folder: Path) -> StudyFiles:
         raise InputError(f"{home}: holds no mesh; give one of each specimen (STL, PLY, OBJ, OFF)")
     scans: list[ScanFile] = []
     remarks: list[Remark] = []
-    for scanner in sorted(path for path in finished(folder) if path.is_dir() and path != home):
+    for scanner in sorted(path for path in list_finished(folder) if path.is_dir() and path != home):
         for specimen, path in _of_scanner(scanner, references, remarks):
             scans.append(ScanFile(scanner=scanner.name, specimen=specimen, scan=path.stem, path=path))
     return StudyFiles(scans=_told_apart(scans), references=references, remarks=tuple(remarks))
@@ -181,7 +183,7 @@ def _of_scanner(scanner: Path, references: Mapping[str, Path], remarks: list[Rem
     elif direct:
         why = f"{len(direct)} meshes lie in no folder of a specimen ({', '.join(references)}); left out"
         remarks.append(Remark(what=scanner.name, why=why, left_out=True))
-    for folder in sorted(path for path in finished(scanner) if path.is_dir()):
+    for folder in sorted(path for path in list_finished(scanner) if path.is_dir()):
         meshes = _meshes(folder)
         if folder.name in references:
             yield from ((folder.name, path) for path in meshes)
@@ -192,7 +194,7 @@ def _of_scanner(scanner: Path, references: Mapping[str, Path], remarks: list[Rem
 
 
 def _meshes(folder: Path) -> list[Path]:
-    return sorted(path for path in finished(folder) if path.is_file() and path.suffix.lower() in MESH_SUFFIXES)
+    return sorted(path for path in list_finished(folder) if path.is_file() and path.suffix.lower() in MESH_SUFFIXES)
 
 
 def _goes_along(path: Path) -> bool:

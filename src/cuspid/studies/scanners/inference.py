@@ -180,7 +180,7 @@ def compare_scanners(
 ) -> Comparison | None:
     """How scanners differ in a figure of each scan; None for fewer than two scanners with three scans each.
 
-    The correction for the number of figures is left to :func:`corrected`. Raises MissingDependencyError without
+    The correction for the number of figures is left to :func:`correct_p_values`. Raises MissingDependencyError without
     statsmodels.
     """
     counts = {name: list(scanners).count(name) for name in dict.fromkeys(map(str, scanners))}
@@ -195,7 +195,7 @@ def compare_scanners(
         "operator": np.array([each or "" for each in operators])[chosen],
     }
     model = _fit_model(data, names)
-    groups = [_centred(data)[data["scanner"] == name] for name in names]
+    groups = [_subtract_means(data)[data["scanner"] == name] for name in names]
     assumptions = _assumptions(model, groups, data)
     by_ranks = any(each.holds is False for each in assumptions[:2])
     rank = stats.kruskal(*groups)
@@ -214,7 +214,7 @@ def compare_scanners(
     )
 
 
-def corrected(comparisons: Sequence[Comparison]) -> tuple[Comparison, ...]:
+def correct_p_values(comparisons: Sequence[Comparison]) -> tuple[Comparison, ...]:
     """With p corrected for the number of comparisons (Holm)."""
     if not comparisons:
         return ()
@@ -332,7 +332,7 @@ def _fit_mixed(
     return fitted if good and np.all(np.diag(np.asarray(fitted.cov_params()))[: design.shape[1]] > 0) else None
 
 
-def _centred(data: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n"]:
+def _subtract_means(data: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n"]:
     """Values without the mean of their specimen."""
     y = data["y"].astype(np.float64).copy()
     for specimen in np.unique(data["specimen"]):

@@ -15,7 +15,7 @@ from cuspid.evaluation.alignments import AlignmentKind, align_on_area, align_poi
 from cuspid.evaluation.deformation import Deformation, bend, fit_deformation, straighten
 from cuspid.evaluation.distance import SignedDistance
 from cuspid.evaluation.places import deviations_um
-from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, located, register
+from cuspid.evaluation.registration import Alignment, RegistrationOptions, best_scale, locate_place, register
 from cuspid.evaluation.scan_bodies import BodyFit, BodyOptions, fit_body
 from cuspid.evaluation.spans import Station, angle_between_deg, spans
 from cuspid.evaluation.spheres import SphereOptions, evaluate_spheres
@@ -100,7 +100,7 @@ def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> M
     mesh, told = _read(scan, specimen)
     rough = _register(mesh, specimen, options)
     samples, _ = mesh.sample(options.samples, np.random.default_rng([options.seed, 1]))
-    pose, parts, missed = _aligned(scan, mesh, samples, specimen, rough.reference_from_scan, options)
+    pose, parts, missed = _align(scan, mesh, samples, specimen, rough.reference_from_scan, options)
     aligned = mesh.transformed(pose)
     points = pose.apply(samples)
     against = SignedDistance(aligned)
@@ -180,7 +180,7 @@ def _found_fast(mesh: Mesh, surface: SignedDistance, options: RegistrationOption
 Parts = dict[tuple[str, str], Station]
 
 
-def _aligned(
+def _align(
     scan: ScanFile,
     mesh: Mesh,
     samples: Float[np.ndarray, "s 3"],
@@ -313,7 +313,7 @@ def _as_station(
 ) -> Station:
     """Where a part lies in the scan: its own motion first, then what the modes do to it there."""
     centroid, pose, curve = tooth.centroid, tooth.reference_from_scan, specimen.arch_curve
-    middle = located(tooth.points, specimen.reference_surface, pose, centroid)
+    middle = locate_place(tooth.points, specimen.reference_surface, pose, centroid)
     measured = Rigid3(pose.inverse().rotation, middle)
     if curve is not None and deformation is not None:
         moved = middle + measured.rotate(places - centroid)

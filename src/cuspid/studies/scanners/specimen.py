@@ -33,7 +33,7 @@ from cuspid.runtime.values import LONGEST_MM, number
 from cuspid.runtime.workers import computed_once
 from cuspid.storage import MM_PER_UNIT, MeasuredFile, Unit
 from cuspid.storage.files import read_arrays, write_arrays
-from cuspid.studies.scanners.files import area_file, beside, body_file, landmark_file
+from cuspid.studies.scanners.files import area_file, body_file, find_beside, landmark_file
 from cuspid.studies.scanners.soundness import cut_notes, first_of_each, mend_faces
 
 PLACES = 60_000
@@ -182,7 +182,7 @@ def load_specimen(
     labels = np.zeros(len(mesh.faces), dtype=np.int64) if jaw.face_labels is None else np.asarray(jaw.face_labels)
     labelled = bool(np.unique(labels[labels != GUM]).size > 1)
     crown = crowns.faces[places.faces]
-    at = _along(curve, places.points)
+    at = _length_along(curve, places.points)
     body, bodies, missed = _bodies_of(path, mesh, occlusal_from_file, mm)
     notes = (*notes, *told, *missed) if odd is None else (odd, *notes, *told, *missed)
     return Specimen(
@@ -253,7 +253,7 @@ def _curve_of(jaw: Jaw) -> tuple[Float[np.ndarray, "c 3"], tuple[str, ...]]:
     return np.array(curve.points), ()
 
 
-def _along(curve: Float[np.ndarray, "c 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def _length_along(curve: Float[np.ndarray, "c 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
     """Length along the curve at points; NaN without one."""
     if not len(curve):
         return np.full(len(points), np.nan)
@@ -300,14 +300,14 @@ def _area_of(
     file = area_file(path)
     if file is None:
         return np.zeros(len(jaw.mesh.faces), dtype=bool)
-    area = _painted(file, unit).transformed(occlusal_from_file)
+    area = _read_painted(file, unit).transformed(occlusal_from_file)
     chosen = area.closest(jaw.mesh.face_centres)[0] <= _ON_AREA_MM
     if not chosen.any():
         raise InputError(f"{file}: lies nowhere on {path}; it must be a part or a painted copy of it")
     return np.asarray(chosen)
 
 
-def _painted(file: Path, unit: Unit) -> Mesh:
+def _read_painted(file: Path, unit: Unit) -> Mesh:
     """The painted faces of a mesh: those of another colour or label than most; all of it where nothing is painted."""
     mesh, labels, colors = storage.read_labelled_mesh(file, unit)
     if labels is None and colors is not None:
@@ -322,7 +322,7 @@ def _painted(file: Path, unit: Unit) -> Mesh:
 
 
 def _spheres_of(path: Path, occlusal_from_file: Rigid3, mm: float) -> dict[str, Sphere]:
-    file = beside(path, [".spheres.csv"])
+    file = find_beside(path, [".spheres.csv"])
     if file is None:
         return {}
     rows = storage.read_table(file, ("label", "x", "y", "z", "radius"))
@@ -338,7 +338,7 @@ def _bodies_of(
     path: Path, mesh: Mesh, occlusal_from_file: Rigid3, mm: float
 ) -> tuple[Mesh | None, dict[str, Rigid3], tuple[str, ...]]:
     """The library body, where the reference has it, and what was not found."""
-    table, library = beside(path, [".bodies.csv"]), body_file(path)
+    table, library = find_beside(path, [".bodies.csv"]), body_file(path)
     if table is None or library is None:
         return None, {}, ()
     read = storage.read_mesh(library)

@@ -16,7 +16,7 @@ from cuspid.studies.scanners.inference import (
     Comparison,
     bland_altman,
     compare_scanners,
-    corrected,
+    correct_p_values,
     mean_estimate,
     precision_estimate,
     scans_for_precision,
@@ -67,7 +67,7 @@ def _column(rows: Iterable[Row], figure: str) -> Float[np.ndarray, "n"]:
     return np.array([np.nan if row.get(figure) is None else row[figure] for row in rows], dtype=np.float64)
 
 
-def _by(rows: Sequence[Row], *columns: str) -> dict[tuple[Any, ...], list[Row]]:
+def _group_rows(rows: Sequence[Row], *columns: str) -> dict[tuple[Any, ...], list[Row]]:
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row.get(column) for column in columns), []).append(row)
@@ -76,7 +76,7 @@ def _by(rows: Sequence[Row], *columns: str) -> dict[tuple[Any, ...], list[Row]]:
 
 def _estimate(rows: Sequence[Row], figure: str, rng: np.random.Generator) -> dict[str, Any] | None:
     """Mean over specimens with its interval, SD within specimens, median and quartiles over scans."""
-    groups = [_column(each, figure) for each in _by(rows, "specimen").values()]
+    groups = [_column(each, figure) for each in _group_rows(rows, "specimen").values()]
     if not all(np.isfinite(group).all() for group in groups):
         return None
     values = np.concatenate(groups)
@@ -98,13 +98,13 @@ def _estimate(rows: Sequence[Row], figure: str, rng: np.random.Generator) -> dic
 def scanners(tables: Tables, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     """Trueness, precision and modes of each scanner."""
     found = {}
-    for (scanner,), rows in _by(tables.scans, "scanner").items():
+    for (scanner,), rows in _group_rows(tables.scans, "scanner").items():
         estimates = {
             figure: _estimate(rows, figure, rng) for figure in (*FACTOR_FIGURES, *_MODE_COLUMNS, "from_mean_rms_um")
         }
         found[scanner] = {
             "scans": len(rows),
-            "specimens": len(_by(rows, "specimen")),
+            "specimens": len(_group_rows(rows, "specimen")),
             "trueness": estimates,
             "precision": {
                 figure: _precision(tables, scanner, figure) for figure in ("mean_abs_um", "rms_um", "p95_um")
@@ -122,7 +122,7 @@ def _precision(tables: Tables, scanner: str, figure: str) -> dict[str, Any] | No
     if not rows:
         return None
     if rows[0]["first"] == "mean of the group":  # not pairs: no scan is in two rows
-        groups = [_column(each, figure) for each in _by(rows, "specimen").values()]
+        groups = [_column(each, figure) for each in _group_rows(rows, "specimen").values()]
         found = mean_estimate(groups, np.random.default_rng(0))
     else:
         found = precision_estimate(pair_matrices(rows, figure))
@@ -132,7 +132,7 @@ def _precision(tables: Tables, scanner: str, figure: str) -> dict[str, Any] | No
 def pair_matrices(rows: Sequence[Row], figure: str) -> list[Float[np.ndarray, "n n"]]:
     """The figure of all pairs of a scanner, a symmetric matrix for each specimen."""
     matrices = []
-    for each in _by(rows, "specimen").values():
+    for each in _group_rows(rows, "specimen").values():
         names = list(dict.fromkeys(name for row in each for name in (row["first"], row["second"])))
         matrix = np.zeros((len(names), len(names)))
         for row in each:
@@ -164,7 +164,7 @@ def factors(scans: Sequence[Row], rng: np.random.Generator) -> dict[str, dict[st
     named = ["scanner", "specimen", "operator", *sorted(known - figure_names - set(COLUMNS))]
     found = {}
     for factor in named:
-        levels = {str(level): rows for (level,), rows in _by(scans, factor).items() if level is not None}
+        levels = {str(level): rows for (level,), rows in _group_rows(scans, factor).items() if level is not None}
         if len(levels) > 1 or factor == "scanner":
             found[factor] = {
                 level: {figure: _estimate(rows, figure, rng) for figure in FACTOR_FIGURES}
@@ -179,7 +179,9 @@ def factors(scans: Sequence[Row], rng: np.random.Generator) -> dict[str, dict[st
 def spans(rows: Sequence[Row]) -> list[Row]:
     """Errors of distances of each scanner, by kind: all of them, and those that have a name."""
     found = []
-    for (kind, scanner), each in sorted(_by(rows, "kind", "scanner").items(), key=lambda item: KINDS.index(item[0][0])):
+    for (kind, scanner), each in sorted(
+        _group_rows(rows, "kind", "scanner").items(), key=lambda item: KINDS.index(item[0][0])
+    ):
         found.append(_spans_row(kind, scanner, "all pairs", each))
         for name, pairs in _ACROSS.items():
             across = [row for row in each if frozenset({row["first"], row["second"]}) in pairs]
@@ -210,11 +212,11 @@ def _spans_row(kind: str, scanner: str, name: str, rows: Sequence[Row]) -> Row:
 def parts(tables: Tables) -> list[Row]:
     """Positions and axes of spheres and scan bodies: trueness over scans, precision over pairs of scans."""
     found = []
-    for (kind, scanner), rows in _by(tables.shifts, "kind", "scanner").items():
+    for (kind, scanner), rows in _group_rows(tables.shifts, "kind", "scanner").items():
         if kind not in ("bodies", "spheres"):
             continue
         axes = _column(rows, "axis_deg")
-        precise = [_pair_distances_um(each) for each in _by(rows, "specimen", "label").values()]
+        precise = [_pair_distances_um(each) for each in _group_rows(rows, "specimen", "label").values()]
         precise = [each for each in precise if len(each)]
         found.append(
             {
@@ -240,7 +242,7 @@ def agreements(rows: Sequence[Row]) -> list[Agreement]:
         return []
     kind = min({row["kind"] for row in rows}, key=KINDS.index)
     means: dict[str, dict[tuple[Any, ...], float]] = {}
-    for (scanner, *place), each in _by(
+    for (scanner, *place), each in _group_rows(
         [row for row in rows if row["kind"] == kind], "scanner", "specimen", "first", "second"
     ).items():
         means.setdefault(scanner, {})[tuple(place)] = float(_column(each, "error_um").mean())
@@ -259,17 +261,17 @@ def _comparisons(scans: Sequence[Row], rng: np.random.Generator) -> tuple[Compar
     scanner, specimen = ([str(row[column]) for row in scans] for column in ("scanner", "specimen"))
     operator = [row.get("operator") for row in scans]
     found = [compare_scanners(figure, _column(scans, figure), scanner, specimen, operator, rng) for figure in TESTED]
-    return corrected([each for each in found if each is not None])
+    return correct_p_values([each for each in found if each is not None])
 
 
 def plan(scans: Sequence[Row], comparisons: Sequence[Comparison], asked_um: float | None) -> dict[str, Any] | None:
     """Sample sizes of the next study from the scatter of this one; None where no scan was repeated."""
-    groups = [_column(each, "mean_abs_um") for each in _by(scans, "scanner", "specimen").values()]
+    groups = [_column(each, "mean_abs_um") for each in _group_rows(scans, "scanner", "specimen").values()]
     freedom = sum(len(group) - 1 for group in groups)
     if not freedom:
         return None
     sd_um = float(np.sqrt(sum(np.sum((group - group.mean()) ** 2) for group in groups) / freedom))
-    count = len(_by(scans, "scanner"))
+    count = len(_group_rows(scans, "scanner"))
     pairs = max(1, count * (count - 1) // 2)
     differences = sorted({*_DIFFERENCES_UM, *([] if asked_um is None else [asked_um])})
     return {

@@ -199,7 +199,7 @@ def _specimens(
             notes = storage.read_json(folder / "specimen.json")["notes"]
             remarks += [Remark(what=f"reference of {name}", why=note) for note in notes]
         except CuspidError as error:
-            count = len(files.of(name))
+            count = len(files.scans_of(name))
             why = f"{error}; its {count} scan{'s are' if count > 1 else ' is'} left out"
             remarks.append(Remark(what=f"reference of {name}", why=why, left_out=True))
         progress("specimens", done, len(names))

@@ -97,7 +97,7 @@ def read_measured(folder: Path, key: str) -> Measured:
 def find_common(specimen: Specimen, scans: Sequence[ScanFile], folder: Path, options: StudyOptions) -> Common:
     """What all scans of a specimen show, without those that are partial. Raises InputError where that is nothing."""
     region = region_of(specimen, options)
-    shown = {scan.key: _shown(folder, scan.key) & region for scan in scans}
+    shown = {scan.key: _read_shown(folder, scan.key) & region for scan in scans}
     any_shows = np.any(list(shown.values()), axis=0)
     most = max(1, int(np.sort([each.sum() for each in shown.values()])[len(shown) // 2]))
     kept, remarks = [], []
@@ -142,7 +142,7 @@ def coverage_remarks(
     return tuple(remarks)
 
 
-def _shown(folder: Path, key: str) -> Bool[np.ndarray, "p"]:
+def _read_shown(folder: Path, key: str) -> Bool[np.ndarray, "p"]:
     return np.isfinite(read_arrays(folder / f"{key}.npz", remedy="delete it and run again")["place_um"])
 
 
@@ -174,7 +174,7 @@ class Compared:
     """Share of the scan's surface over what is evaluated that is farther from it than the limit."""
 
 
-def compared(scan: ScanFile, folder: Path, specimen: Specimen, common: Common, options: StudyOptions) -> Compared:
+def compare_scan(scan: ScanFile, folder: Path, specimen: Specimen, common: Common, options: StudyOptions) -> Compared:
     """Read a scan and align it finally: a best fit is made anew, to the places that all scans show, so that gum and
     borders of one scan do not move it."""
     measured = read_measured(folder, scan.key)
@@ -434,7 +434,7 @@ def summarise(
         for scanner in dict.fromkeys(scan.scanner for scan in common.scans):
             group = []
             for scan in (each for each in common.scans if each.scanner == scanner):
-                group.append(compared(scan, folder, specimen, common, options))
+                group.append(compare_scan(scan, folder, specimen, common, options))
                 keep(group[-1], specimen)
                 done += 1
                 progress("figures", done, total)
