@@ -7,12 +7,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import grid_cases
 from cuspid.runtime.errors import InputError
-from cuspid.studies.grid import Case, grid, run_grid, table
+from cuspid.studies.grid import Case, _failure, grid, run_grid, table
 
 
 def cases(values, **fixed):
@@ -137,6 +138,12 @@ def test_a_cluster_that_loses_a_worker_gives_the_serial_table(tmp_path, cluster)
     assert (tmp_path / "cluster" / "first").exists(), "no worker was killed"
     assert table(clustered).replace("/cluster", "/serial") == table(serial)
     assert all(outcome.failure is None for outcome in clustered)
+
+
+def test_a_scheduler_that_is_lost_and_a_worker_that_fails_are_named():
+    assert "scheduler at tcp://a:1 was lost" in _failure(SimpleNamespace(status="cancelled"), "tcp://a:1")
+    failed = SimpleNamespace(status="error", exception=lambda: RuntimeError("no room\nfor more"))
+    assert _failure(failed, "tcp://a:1") == "RuntimeError: no room"
 
 
 def test_a_cluster_that_does_not_answer(tmp_path, monkeypatch):

@@ -263,10 +263,15 @@ def _on_cluster(cases: Sequence[Case], work: Work, address: str) -> Iterator[Out
             if future.status == "finished":
                 yield future.result()
             else:
-                lost = future.exception()
-                yield Outcome(
-                    case=futures[future], figures={}, failure=f"{type(lost).__name__}: {lost}".splitlines()[0]
-                )
+                yield Outcome(case=futures[future], figures={}, failure=_failure(future, address))
+
+
+def _failure(future: Any, address: str) -> str:
+    """Why there is no outcome, in one line; a future without an exception went down with its scheduler."""
+    error = future.exception() if future.status == "error" else None
+    if error is None:
+        return f"the Dask scheduler at {address} was lost; start it again and give --retry-failed"
+    return f"{type(error).__name__}: {error}".splitlines()[0]
 
 
 def _slots(workers: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
