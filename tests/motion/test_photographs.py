@@ -303,7 +303,7 @@ def test_dark_photographs_of_16_bits_have_the_keypoints_of_bright_ones(tmp_path,
     found, _ = detect_in_all(
         read_photographs(tmp_path, tmp_path).photographs,
         PhotographOptions().features,
-        largest_px=2400,
+        max_image_px=2400,
         even=even,
         progress=lambda *_: None,
     )

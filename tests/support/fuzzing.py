@@ -205,7 +205,7 @@ def _landmarks(folder: Path) -> None:
 def _brief(folder: Path) -> None:
     (folder / "brief.toml").write_text(
         'name = "probe"\nsensor = "thesis"\nthickness_mm = 7.0\nworking_distance_mm = [4.5, 5.5]\n'
-        "[mouth]\ntooth = 7\npeople = 0.95\n[surfaces]\nocclusal = 0.98\nbuccal = 0.9\n[cameras]\nmost = 12\n"
+        "[mouth]\ntooth = 7\npeople = 0.95\n[surfaces]\nocclusal = 0.98\nbuccal = 0.9\n[cameras]\nmax = 12\n"
         "[motion]\nturns = 1\nturn_deg = 60.0\n[weights]\ncoverage = 1.0\nprecision = 1.0\ncameras = 0.3\n"
     )
 
