@@ -646,12 +646,12 @@ def _of_board(scene: BoardScene) -> Iterator[str]:
 def _of_time(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> Iterator[str]:
     """Where the cameras do not expose together, or not all of their rows."""
 
-    def told(name: str, frames: float, sigma: float | None, digits: int) -> str:
+    def describe(name: str, frames: float, sigma: float | None, digits: int) -> str:
         in_ms = "" if frames_per_s is None else f" ({1000 * frames / frames_per_s:+.1f} ms)"
         return f"{name} {frames:+.{digits}f} ± {sigma:.{digits}f}{in_ms}"
 
     delays = [
-        told(name, check.delay_frames, check.delay_spread_frames, 2)
+        describe(name, check.delay_frames, check.delay_spread_frames, 2)
         for name, check in checks.items()
         if check.delay_frames is not None
     ]
@@ -661,7 +661,9 @@ def _of_time(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> I
             f"{', '.join(delays)}; this is taken into account, but a board that is held still gives more"
         )
     readouts = [
-        told(name, check.readout, check.readout_sigma, 3) for name, check in checks.items() if check.readout is not None
+        describe(name, check.readout, check.readout_sigma, 3)
+        for name, check in checks.items()
+        if check.readout is not None
     ]
     if readouts:
         yield (
