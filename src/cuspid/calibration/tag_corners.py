@@ -61,7 +61,7 @@ def find_tag_corners(
     found = {tag: each for tag, outline in outlines.items() if (each := _refine_tag(image, outline)) is not None}
     new = found
     while new:
-        new = dict(_foretold(image, board, found, new))
+        new = dict(_find_predicted_tags(image, board, found, new))
         found |= new
     if not found:
         return None
@@ -130,7 +130,7 @@ def _refine_tag(image: UInt8[np.ndarray, "h w"], outline: Outline) -> Outline | 
     return found if (moved < max(2.0 * half, _REACH * side)).all() else None
 
 
-def _foretold(
+def _find_predicted_tags(
     image: UInt8[np.ndarray, "h w"], board: Board, found: dict[int, Outline], new: dict[int, Outline]
 ) -> Iterator[tuple[int, Outline]]:
     """Tags beside some new ones, by what has been found around them, if the image shows their bits there."""
