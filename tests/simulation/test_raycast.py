@@ -10,7 +10,7 @@ import pytest
 
 from builders import SavedImages, sphere
 from cuspid.geometry import Rigid3
-from cuspid.geometry.gloss import coat, leaving
+from cuspid.geometry.gloss import coat, transmittance
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.model.camera import Camera
 from cuspid.model.capture import Frame
@@ -191,7 +191,7 @@ def test_less_light_leaves_a_clear_surface_at_grazing_angles() -> None:
     matte_image, clear_image = (light_seen(jaw, probe(led(x=2.0), camera=wide), look) for look in (PLAIN, clear))
     rays = wide.rays(wide.pixel_centres().reshape(-1, 2))
     cosines = (1 / np.linalg.norm(rays, axis=-1)).reshape(matte_image.shape)
-    expected = np.vectorize(leaving)(cosines, 1.5)
+    expected = np.vectorize(transmittance)(cosines, 1.5)
     assert expected.min() < 0.95
     np.testing.assert_allclose(clear_image / matte_image, expected, rtol=1e-4)
 

@@ -117,7 +117,7 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     mesh = mesh.thinned(_ENOUGH_FACES)
     start, notes = _upright(mesh)
     rests = not _is_part(mesh, start.rotation[2])
-    relief, level = _level_frame(mesh, _resting(_relief(mesh, start), start) if rests else start)
+    relief, level = _level_frame(mesh, _rest_on_crowns(_relief(mesh, start), start) if rests else start)
     crowns = relief.crowns()
     if len(crowns) == 0:
         note = "occlusal frame: unsure, as nothing looks like a crown; check the picture"
@@ -221,7 +221,7 @@ def _level_frame(
     return _relief(mesh, frame, off_plane_mm), frame
 
 
-def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
+def _rest_on_crowns(relief: _Relief, frame: Rigid3) -> Rigid3:
     """Turn a frame so that +Z is normal to the plane on which the jaw would rest, crowns down."""
     points = relief.points[np.isfinite(relief.points[..., 2])]
     if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6) < 3:

@@ -67,7 +67,7 @@ def named_surfaces(jaw: Jaw, options: SurfaceOptions = SurfaceOptions()) -> dict
     for fdi, axes in tooth_axes(jaw).items():
         faces = np.flatnonzero(jaw.tooth_faces(fdi))
         codes[faces] = _codes(fdi, _places(jaw, faces, axes), jaw.mesh.face_normals[faces] @ axes.T, options)
-    codes[_beside_teeth(jaw, options.gingival_mm)] = SURFACES.index("gingival")
+    codes[_gum_beside_teeth(jaw, options.gingival_mm)] = SURFACES.index("gingival")
     return {name: codes == code for code, name in enumerate(SURFACES)}
 
 
@@ -157,7 +157,7 @@ def _rim(
     return np.interp(wanted, (np.arange(_WEDGES) + 0.5) / _WEDGES, smooth, period=1.0)
 
 
-def _beside_teeth(jaw: Jaw, reach_mm: float) -> Int[np.ndarray, "n"]:
+def _gum_beside_teeth(jaw: Jaw, reach_mm: float) -> Int[np.ndarray, "n"]:
     """The faces of the gum that lie near a tooth."""
     tooth = np.any([jaw.tooth_faces(fdi) for fdi in jaw.teeth], axis=0)
     gum = np.flatnonzero(~tooth)

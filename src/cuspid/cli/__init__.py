@@ -151,14 +151,14 @@ _IN_OTHER_LETTERS = "cuspid.in_other_letters"
 _LETTERS = {"µ": "u", "μ": "u", "±": "+-", "°": " deg", "²": "2", "³": "3", "×": "x", "…": "...", "—": "-", "–": "-"}
 
 
-def _in_other_letters(error: UnicodeError) -> tuple[str, int]:
+def _describe_system_error(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     wanted = error.object[error.start : error.end]
     return "".join(_LETTERS.get(letter, "?") for letter in wanted), error.end
 
 
-codecs.register_error(_IN_OTHER_LETTERS, _in_other_letters)
+codecs.register_error(_IN_OTHER_LETTERS, _describe_system_error)
 
 
 def _run_verb(verb: str, given: list[str]) -> None:

@@ -173,11 +173,11 @@ def _print(parts: tuple[Stitched, ...], folders: list[Path]) -> None:
     whole = parts[0].panorama
     for note in whole.notes:
         console.print(f"note: {note}")
-    for line in left_out(whole.frames):
+    for line in left_out_reasons(whole.frames):
         console.print(f"  left out {line}")
 
 
-def left_out(frames: Iterable[FrameUse]) -> list[str]:
+def left_out_reasons(frames: Iterable[FrameUse]) -> list[str]:
     """The frames that are in no part, one line for each reason."""
     names: dict[str, list[str]] = {}
     for frame in frames:

@@ -21,7 +21,7 @@ from cuspid.calibration.coverage import Coverage, CoverageOptions, coverage_cell
 from cuspid.cli.calibration import BoardFiles, target_of
 from cuspid.cli.shared import Flat, console
 from cuspid.footage.cameras import CameraSource, ExposureOptions, Ready
-from cuspid.footage.devices import FormatOptions, V4L2Camera, cameras_there
+from cuspid.footage.devices import FormatOptions, V4L2Camera, find_cameras
 from cuspid.footage.played import FilmCamera, RenderedCamera
 from cuspid.footage.quality import measure_quality, shrink_to_grey
 from cuspid.footage.record import Recording, RecordOptions, Status, Together, require_names
@@ -166,7 +166,7 @@ def _simulate_cameras(handpiece: Path, form: FormatOptions, board: Target) -> di
 
 
 def _print_cameras() -> None:
-    found = cameras_there()
+    found = find_cameras()
     if not found:
         console.print("no camera is plugged in (there is no /dev/video* that delivers images)", soft_wrap=True)
         return

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from cuspid.footage.cameras import ExposureOptions, Pixels, Ready, Setting, Shot
-from cuspid.footage.jpeg import whole_jpeg
+from cuspid.footage.jpeg import complete_jpeg
 from cuspid.footage.quality import measure_quality, shrink_to_grey
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Options, Range
@@ -74,7 +74,7 @@ def open_device(device: str) -> Device:
     """A device of Video4Linux, whose images are taken as they are. Raises InputError where it cannot be opened."""
     if not Path(device).exists():
         raise InputError(f"{device}: no such camera; cuspid record --list names those that are there")
-    with _quiet():
+    with _silence_opencv():
         capture = cv2.VideoCapture(device, cv2.CAP_V4L2)
     if not capture.isOpened():
         raise InputError(
@@ -85,7 +85,7 @@ def open_device(device: str) -> Device:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_opencv() -> Iterator[None]:
     """What OpenCV would print of a device that fails is told in one line."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -233,7 +233,7 @@ class V4L2Camera:
         self._has_read = True
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
         self._is_stamped = self._is_stamped and now_s - _MOST_LATE_S < stamp_s <= now_s
-        data = _as_delivered(delivered)
+        data = _whole_image(delivered)
         return None if data is None else Shot(time_s=stamp_s if self._is_stamped else now_s, data=data)
 
 
@@ -241,10 +241,10 @@ _AS_DELIVERED = ("MJPG", "JPEG", "GREY", "Y10", "Y12", "Y16")
 """Pixels that OpenCV hands over as they are, compressed or grey; it converts others to BGR."""
 
 
-def _as_delivered(found: np.ndarray) -> bytes | Pixels | None:
+def _whole_image(found: np.ndarray) -> bytes | Pixels | None:
     """A JPEG file, or pixels; None where it is damaged."""
     if found.dtype == np.uint8 and found.ndim == 2 and min(found.shape) == 1:
-        return whole_jpeg(found.tobytes())
+        return complete_jpeg(found.tobytes())
     return cv2.cvtColor(found, cv2.COLOR_BGR2RGB) if found.ndim == 3 and found.shape[2] == 3 else found.copy()
 
 
@@ -271,7 +271,7 @@ _HAS_OWN, _CAPTURES = 0x80000000, 0x1
 _MOST_FORMATS = 32
 
 
-def cameras_there(root: Path = Path("/dev")) -> tuple[FoundCamera, ...]:
+def find_cameras(root: Path = Path("/dev")) -> tuple[FoundCamera, ...]:
     """The cameras that are plugged in; devices that deliver no images, as of metadata, are left out."""
     devices = [path for path in root.glob("video*") if re.fullmatch(r"video\d+", path.name)]
     ordered = sorted(devices, key=lambda path: int(path.name.removeprefix("video")))

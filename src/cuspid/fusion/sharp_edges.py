@@ -85,8 +85,8 @@ def _move_to_edges(
 ) -> Float[np.ndarray, "v 3"]:
     """The vertices, with those of the candidates that an edge asks for on it."""
     foot, along = _lines(mesh, candidates, detail_mm, options)
-    places = _onto_edges(mesh, foot, along, options.max_outwards * detail_mm)
-    return _without_turned(mesh, np.flatnonzero(np.isfinite(places[:, 0])), places)
+    places = _targets_on_edges(mesh, foot, along, options.max_outwards * detail_mm)
+    return _undo_flips(mesh, np.flatnonzero(np.isfinite(places[:, 0])), places)
 
 
 def _within_reach(mesh: Mesh, candidates: Bool[np.ndarray, "v"], reach_mm: float) -> Bool[np.ndarray, "f"]:
@@ -152,7 +152,7 @@ def _lines(
     return foot, along
 
 
-def _onto_edges(
+def _targets_on_edges(
     mesh: Mesh, foot: Float[np.ndarray, "v 3"], along: Float[np.ndarray, "v 3"], most_mm: float
 ) -> Float[np.ndarray, "v 3"]:
     """New places of the vertices, NaN for those that stay: of the two ends of each side of a face that crosses an edge,
@@ -184,9 +184,7 @@ def _outwards(mesh: Mesh, vertices: Int[np.ndarray, "n"], places: Float[np.ndarr
     return np.asarray(((places - mesh.vertices[vertices]) * mesh.vertex_normals[vertices]).sum(axis=1))
 
 
-def _without_turned(
-    mesh: Mesh, moved: Int[np.ndarray, "n"], places: Float[np.ndarray, "v 3"]
-) -> Float[np.ndarray, "v 3"]:
+def _undo_flips(mesh: Mesh, moved: Int[np.ndarray, "n"], places: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     """The vertices with those that are moved, but for corners of faces that would turn over."""
     vertices = mesh.vertices.copy()
     vertices[moved] = places[moved]

@@ -81,7 +81,7 @@ def fuse(
         funnel = sum_funnels(depth_map.funnel for depth_map in depths)
         cleaned, report = clean(raw.mesh, detail_mm, cleaning)
         if not len(cleaned.faces):
-            raise ReconstructionError(f"no surface: {_what_took_it(funnel, len(raw.mesh.faces))}")
+            raise ReconstructionError(f"no surface: {_explain_empty_surface(funnel, len(raw.mesh.faces))}")
         sigma_um = _sigma_um(cleaned, raw, expected)
         mesh, moved = sharpen_edges(cleaned, detail_mm, sharp_edges)
         scale: Literal["known", "unknown"] = "known" if has_scale else "unknown"
@@ -105,7 +105,7 @@ def fuse(
     return made.mesh, made.vertex_values[SIGMA]
 
 
-def _what_took_it(funnel: Funnel | None, faces: int) -> str:
+def _explain_empty_surface(funnel: Funnel | None, faces: int) -> str:
     """Why nothing is left, and what to change."""
     if funnel is None or not funnel.kept:
         told = "the depth maps are empty" if funnel is None else f"the depth maps are empty ({funnel.summary})"

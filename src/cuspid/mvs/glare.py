@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from cuspid.geometry import unit
-from cuspid.geometry.gloss import coat, leaving
+from cuspid.geometry.gloss import coat, transmittance
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Light
 from cuspid.runtime.kernels import kernel
@@ -129,5 +129,5 @@ def _gloss(falling, facing, halfway, grazing):
 def _leaving(facing, index):
     out = np.empty_like(facing)
     for i in range(len(out)):
-        out[i] = leaving(max(facing[i], _OBLIQUE), index)
+        out[i] = transmittance(max(facing[i], _OBLIQUE), index)
     return out

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from cuspid.geometry import Rigid3, read_only
-from cuspid.geometry.gloss import coat, leaving
+from cuspid.geometry.gloss import coat, transmittance
 from cuspid.model.camera import Camera
 from cuspid.model.capture import Frame
 from cuspid.model.jaw import Jaw
@@ -389,7 +389,7 @@ def _shade(rays, albedos, surface, palette, lights, chosen, counts, light, sampl
             view = (direction[0] * inverse, direction[1] * inverse, direction[2] * inverse)
             scattered = albedo
             if palette.exit_index[m] > 1:
-                share = leaving(-dot(normal, view), palette.exit_index[m])
+                share = transmittance(-dot(normal, view), palette.exit_index[m])
                 scattered = (albedo[0] * share, albedo[1] * share, albedo[2] * share)
             for c in range(3):
                 out[pixel, c] += scattered[c] * light.ambient[n, c] / samples

@@ -29,7 +29,7 @@ from skimage.morphology import remove_small_holes, remove_small_objects
 from skimage.restoration import inpaint_biharmonic
 
 from cuspid.geometry import Rigid3
-from cuspid.geometry.gloss import leaving
+from cuspid.geometry.gloss import transmittance
 from cuspid.geometry.semi_global import semi_global
 from cuspid.model.camera import Camera, undistortion_maps
 from cuspid.model.sparse_model import SparseModel
@@ -257,7 +257,7 @@ def _made_up_for(facing, index, gamma):
     """By what grey levels are to be multiplied where a body is seen at an angle of this cosine to its normal."""
     out = np.empty(facing.shape, np.float32)
     for place in np.ndindex(facing.shape):
-        out[place] = leaving(max(facing[place], _OBLIQUE), index) ** (-1 / gamma)
+        out[place] = transmittance(max(facing[place], _OBLIQUE), index) ** (-1 / gamma)
     return out
 
 

@@ -46,7 +46,7 @@ def with_holder(handpiece: Handpiece, options: HolderOptions = HolderOptions()) 
     cameras = {name: module(each.cam_from_rig, options.camera_mm) for name, each in handpiece.rig.cameras.items()}
     lights = {name: module(each.light_from_rig, options.led_mm) for name, each in handpiece.lights.items()}
     modules = [*cameras.values(), *lights.values()]
-    plates = [_plate(handpiece, group, modules, options) for group in alike(handpiece)]
+    plates = [_plate(handpiece, group, modules, options) for group in group_by_direction(handpiece)]
     parts: dict[str, Box] = {f"camera {name}": box for name, box in cameras.items()}
     parts |= {f"light {name}": box for name, box in lights.items()}
     parts |= {f"plate {number}": plate for number, plate in enumerate(plates, start=1)}
@@ -56,7 +56,7 @@ def with_holder(handpiece: Handpiece, options: HolderOptions = HolderOptions()) 
     return replace(handpiece, body=Body(parts))
 
 
-def alike(handpiece: Handpiece) -> list[list[str]]:
+def group_by_direction(handpiece: Handpiece) -> list[list[str]]:
     """Cameras by the way they look, in the order of the rig."""
     groups: list[list[str]] = []
     for name, mounted in handpiece.rig.cameras.items():

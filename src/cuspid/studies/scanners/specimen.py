@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from cuspid import storage
 from cuspid.anatomy.crowns import crowns_of
-from cuspid.anatomy.jaw_files import Labelling, named_arch
+from cuspid.anatomy.jaw_files import Labelling, arch_from_name
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.anatomy.surfaces import SURFACES, named_surfaces
 from cuspid.evaluation.distance import SignedDistance
@@ -233,7 +233,7 @@ def _load_reference(
     occlusal = find_occlusal_frame(mesh)
     upright = mesh.transformed(occlusal.occlusal_from_mesh)
     notes = (*doubled, *facing, *cut_notes(mesh), *occlusal.notes)
-    arch = arch or named_arch(path)
+    arch = arch or arch_from_name(path)
     if labels is not None:
         try:
             numbered = labelling.fdi(path, labels, upright, arch=arch, sure=not occlusal.notes)
