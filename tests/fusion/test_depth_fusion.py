@@ -491,6 +491,6 @@ def test_no_vertex_in_view_is_culled() -> None:
     depth_map = depth_maps(HILLS)[0]
     cam_from_world = depth_map.cam_from_rig @ POSES[depth_map.frame]
     in_view = depth_map.camera.contains(depth_map.camera.project(cam_from_world.apply(mesh.vertices)))
-    chosen = np.isin(np.arange(len(mesh.vertices)) // 256, votes._in_view(depth_map.camera, cam_from_world))
+    chosen = np.isin(np.arange(len(mesh.vertices)) // 256, votes._chunks_in_view(depth_map.camera, cam_from_world))
     assert in_view.any()
     assert chosen[in_view].all()

@@ -286,10 +286,11 @@ def test_presets_differ_in_contrast_and_seeds_in_pattern() -> None:
 def test_a_sprayed_texture_suits_the_cameras_and_enamel_stays_enamel() -> None:
     for footprint_mm, factor in ((0.0117, 1), (0.003, 1), (0.053, 1), (0.1, 8), (0.0015, 0.125), (12.0, 1024)):
         for name in ("artificial", "powder"):
-            before, after = APPEARANCES[name].gum, APPEARANCES[name].seen_by(footprint_mm).gum
+            before, after = APPEARANCES[name].gum, APPEARANCES[name].at_footprint(footprint_mm).gum
             assert after.wavelengths_mm == tuple(factor * wavelength for wavelength in before.wavelengths_mm)
         assert (
-            APPEARANCES["enamel"].seen_by(footprint_mm).gum.wavelengths_mm == APPEARANCES["enamel"].gum.wavelengths_mm
+            APPEARANCES["enamel"].at_footprint(footprint_mm).gum.wavelengths_mm
+            == APPEARANCES["enamel"].gum.wavelengths_mm
         )
 
 

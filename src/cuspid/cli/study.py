@@ -27,7 +27,7 @@ from cuspid.studies.grid import check_workers
 from cuspid.studies.scanners.files import Remark
 from cuspid.studies.scanners.scan import StudyOptions
 from cuspid.studies.scanners.statistics import summary as summarised
-from cuspid.studies.scanners.study import Intake, Prepared, Study, compare, foreseen, prepare
+from cuspid.studies.scanners.study import Intake, Prepared, Study, compare, plan_comparison, prepare
 from cuspid.studies.scanners.text import ANCHORS, checklist, methods
 from cuspid.studies.scanners.views import write_views
 
@@ -101,7 +101,7 @@ def study(
             )
             found = None if dry_run else compare(prepared, out, options, progress)
         if found is None:
-            _print_remarks(foreseen(prepared, out, options))
+            _print_remarks(plan_comparison(prepared, out, options))
             _print_plan(prepared)
             return
         save_study(out, found, options, plan_um)

@@ -223,8 +223,8 @@ def flash_starts(brightness: Signals, options: SyncOptions) -> dict[str, int]:
     for camera, its in flashes.items():
         if len(its) != len(flashes[model]):
             raise InputError(
-                f"{camera}: {_describe_flashes(its)}, but in {model} {_describe_flashes(flashes[model])}; cut the films "
-                "so that all show the same ones, or use another --sync"
+                f"{camera}: {_describe_flashes(its)}, but in {model} {_describe_flashes(flashes[model])}; cut the "
+                "films so that all show the same ones, or use another --sync"
             )
         gaps, others = (np.diff(each) for each in (its, flashes[model]))
         if (np.abs(gaps - others) > 1).any():

@@ -29,7 +29,7 @@ from cuspid.model.reconstruction import DepthMap, SurfacePoints
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.options import Options, Range
 from cuspid.runtime.progress import Progress, silent
-from cuspid.runtime.workers import in_shares, map_batches
+from cuspid.runtime.workers import map_batches, run_in_shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +269,7 @@ class Votes:
 
     def in_view(self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, frame: int) -> Voter:
         """A depth map with the vertices that it may see; ``frame`` is the number of its frame, starting from 1."""
-        chunks = self._in_view(depth_map.camera, cam_from_world)
+        chunks = self._chunks_in_view(depth_map.camera, cam_from_world)
         return Voter(evidence, cam_from_world, chunks, colors_of(depth_map), depth_map.sigma_mm.ravel(), frame)
 
     def collect(self, voters: Sequence[Voter], agreement_mm: float) -> None:
@@ -299,9 +299,9 @@ class Votes:
                     self.stated,
                 )
 
-        in_shares(work)
+        run_in_shares(work)
 
-    def _in_view(self, camera: Camera, cam_from_world: Rigid3) -> Int[np.ndarray, "k"]:
+    def _chunks_in_view(self, camera: Camera, cam_from_world: Rigid3) -> Int[np.ndarray, "k"]:
         """Chunks whose ball meets the pyramid of view (a few more, never less)."""
         centres, radii = cam_from_world.apply(self.balls[:, :3]), self.balls[:, 3]
         corners = camera.rays(

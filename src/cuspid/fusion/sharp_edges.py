@@ -23,7 +23,7 @@ from cuspid.fusion.volume import neighbour_keys, pack
 from cuspid.model.mesh import Mesh, used_vertices
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.options import Options, Range
-from cuspid.runtime.workers import in_shares
+from cuspid.runtime.workers import run_in_shares
 
 _RINGS = 2
 """So many vertices beside a place where the surface bends are tried, too."""
@@ -146,7 +146,7 @@ def _lines(
     def work(share: int, shares: int) -> None:
         _find_lines(surface, candidates, share, shares, limits, foot, along)
 
-    in_shares(work)
+    run_in_shares(work)
     inwards = ~(_outwards(mesh, np.arange(len(foot)), foot) > 0)
     foot[inwards] = along[inwards] = np.nan
     return foot, along

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from cuspid.fusion.evidence import Evidence, observe, observe_foot
 from cuspid.geometry import Rigid3
 from cuspid.runtime.kernels import kernel
-from cuspid.runtime.workers import in_shares
+from cuspid.runtime.workers import run_in_shares
 
 BLOCK = 8
 """Voxels along the side of a block."""
@@ -103,7 +103,7 @@ class SparseVolume:
                     -1.0 if take_out else 1.0,
                 )
 
-        in_shares(work)
+        run_in_shares(work)
 
     def _reach_px(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> int:
         """How many pixels the truncation distance takes at most, seen from the camera."""

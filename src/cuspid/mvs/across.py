@@ -71,7 +71,7 @@ def measure_moving_cameras(
     found = list[DepthMap]()
     for name in handpiece.rig.names:
         moved = f"{name}+"
-        pair = moving_pair(handpiece, name, next_from_rig, stereo.pairing)
+        pair = consecutive_pair(handpiece, name, next_from_rig, stereo.pairing)
         if name not in images or name not in next_images or pair is None:
             continue
         both = {name: images[name], moved: next_images[name]}
@@ -89,7 +89,7 @@ def _discount_weight(depth_map: DepthMap, share: float) -> DepthMap:
     return replace(depth_map, confidence=(share * depth_map.confidence).astype(np.float32), best_mm=best_mm)
 
 
-def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options: PairingOptions) -> Rig | None:
+def consecutive_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options: PairingOptions) -> Rig | None:
     """A camera and the same camera at the next frame; None where they are no stereo pair."""
     mounted = handpiece.rig[name]
     moved = MountedCamera(mounted.camera, mounted.cam_from_rig @ next_from_rig)

@@ -170,7 +170,7 @@ def find_poses(
     """The poses of the frames, and the calibration adjusted to the images (first part of :func:`reconstruct`)."""
     options = resolve_options(options)
     nominal = options.calibration == "refined" and is_nominal(capture.handpiece)
-    capture = replace(capture, handpiece=as_known(capture.handpiece, options))
+    capture = replace(capture, handpiece=apply_uncertainty(capture.handpiece, options))
     if colmap_model is not None:
         return take_poses(capture, colmap_model, folder / "motion")
     if resolve_signal(capture, options) == "shading":
@@ -182,7 +182,7 @@ def find_poses(
     if options.own_images:
         cache = folder / "motion" / "cache"
         doubts += require_own_images(capture, options.tracking, cache=cache, progress=progress)
-    capture, notes = _hold_what_fits(capture, nominal, folder / "motion", options, progress)
+    capture, notes = _hold_consistent_calibration(capture, nominal, folder / "motion", options, progress)
     found = locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
     return replace(found, notes=(*doubts, *notes, *found.notes))
 
@@ -200,7 +200,7 @@ def _unused_shutters(capture: Capture, signal: Signal) -> tuple[str, ...]:
     return ()
 
 
-def _hold_what_fits(
+def _hold_consistent_calibration(
     capture: Capture, nominal: bool, folder: Path, options: ReconstructionOptions, progress: Progress
 ) -> tuple[Capture, tuple[str, ...]]:
     """One instant with the calibration held, and a note, where that states no uncertainty and the images do not
@@ -369,7 +369,7 @@ def _resolve_draft(options: ReconstructionOptions) -> ReconstructionOptions:
     return replace(options, tracking=tracking, stereo=stereo, across=across, fusion=fusion)
 
 
-def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
+def apply_uncertainty(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
     """The handpiece with the uncertainty that is assumed for it."""
     if options.calibration == "fixed":
         return without_covariances(handpiece)

@@ -258,14 +258,14 @@ def radiance_along(
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         own, firsts = slice(top * row, bottom * row), slice(top * row, (bottom + 1) * row, samples)
-        grid = trace(scene.jaw.mesh, _some(origins, firsts), directions[firsts])
-        given = scene.jaw.mesh, scene.surface, _some(origins, own), directions[own]
+        grid = trace(scene.jaw.mesh, _slice_origins(origins, firsts), directions[firsts])
+        given = scene.jaw.mesh, scene.surface, _slice_origins(origins, own), directions[own]
         rays = first_hits(*given, grid, samples, width, moving=moving)
         _add_light(scene, rays, grid, lights, below, out[top:bottom])
     return out
 
 
-def _some(origins: Float[np.ndarray, "#n 3"], which: slice) -> Float[np.ndarray, "#m 3"]:
+def _slice_origins(origins: Float[np.ndarray, "#n 3"], which: slice) -> Float[np.ndarray, "#m 3"]:
     return origins if len(origins) == 1 else origins[which]
 
 
@@ -419,7 +419,7 @@ def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
     reflectance = np.zeros(len(mesh.vertices))
     reflectance[mesh.faces] = scene.palette.reflectance[materials][:, None]
     heights = scene.palette.stipple_mm[1] * scene.surface.stippled
-    _entering(mesh.vertices, mesh.vertex_normals, heights, scene.palette, reflectance, lights, shares)
+    _add_entering_light(mesh.vertices, mesh.vertex_normals, heights, scene.palette, reflectance, lights, shares)
     lit = shares > NOTICEABLE * shares.sum(axis=1, keepdims=True)
     darken(lit, lit, mesh.occluded(*segments(mesh.vertices, lit, lights.positions)))
     return np.einsum("vl,lc->vc", np.where(lit, shares, 0.0), lights.intensities)
@@ -427,7 +427,7 @@ def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
 
 @kernel(fastmath=True)
 @no_type_check
-def _entering(points, normals, heights, palette, reflectance, lights, shares):
+def _add_entering_light(points, normals, heights, palette, reflectance, lights, shares):
     """Fill in the share of each light that enters at each point, if nothing hides it."""
     for i in range(len(points)):
         normal = (normals[i, 0], normals[i, 1], normals[i, 2])
@@ -559,7 +559,9 @@ def _work(task: tuple[Frame, str]) -> tuple[str, str]:
     return _worker(task)
 
 
-def _in_order(frames: Sequence[Frame], skip: Callable[[str, str], bool], together: int) -> list[tuple[Frame, str]]:
+def _frame_by_frame(
+    frames: Sequence[Frame], skip: Callable[[str, str], bool], together: int
+) -> list[tuple[Frame, str]]:
     """All cameras of so many frames at a time, one after the other, for a process remembers the rays of the last."""
     numbered = [
         (index // together, camera, frame)
@@ -586,7 +588,7 @@ def render_capture(
     that the parent built (a forked child could not build one) and run kernels that the parent compiled; those that
     begin anew build their own, and are given the ``sink``, which must then be picklable.
     """
-    tasks = _in_order(frames, skip, _TOGETHER if scene.scattering else max(len(frames), 1))
+    tasks = _frame_by_frame(frames, skip, _TOGETHER if scene.scattering else max(len(frames), 1))
     if not tasks:
         return
     worker = _Worker(

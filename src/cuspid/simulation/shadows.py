@@ -92,7 +92,7 @@ def illuminate(
     below, if there is one.
     """
     chosen, counts = _surfaces(rays.distances, samples)
-    points, light = _unhidden(surface, rays, chosen, counts, lights)
+    points, light = _unoccluded_light(surface, rays, chosen, counts, lights)
     asked = light.lit.copy()
     places, seen = _seen_at_places(mesh, surface, grid, lights, width)
     _agree(rays, chosen, samples, surface, lights, points, grid.distances, width, places, seen, light.lit, asked)
@@ -121,7 +121,7 @@ def _surfaces(distances, samples):
     return chosen[:count], counts[:count]
 
 
-def _unhidden(
+def _unoccluded_light(
     surface: ShadedMesh, rays: Rays, chosen: Int[np.ndarray, "n"], counts: Int[np.ndarray, "n"], lights: Lamps
 ) -> tuple[Float[np.ndarray, "n 3"], Illumination]:
     """Where chosen rays hit, and the light there if nothing hides it."""
@@ -140,7 +140,7 @@ def _seen_at_places(
     rows = np.arange(0, len(grid.faces) // width, STEP)
     places = rows[:, None] * width + np.arange(0, width, STEP)
     chosen = places.ravel()
-    points, light = _unhidden(surface, grid, chosen, np.ones_like(chosen), lights)
+    points, light = _unoccluded_light(surface, grid, chosen, np.ones_like(chosen), lights)
     seen = np.where(light.lit, np.uint8(_LIT), np.uint8(0))
     darken(light.lit, light.lit, mesh.occluded(*segments(points, light.lit, lights.positions)))
     seen[(seen == _LIT) & ~light.lit] = _HIDDEN

@@ -39,7 +39,7 @@ class Compared:
     same_lights: bool
     """Whether the two images of a pair were taken at one instant: a place is then as bright in one as in the other."""
 
-    def seen_from(self, world_from_new: Rigid3) -> Compared:
+    def in_world(self, world_from_new: Rigid3) -> Compared:
         """The same in another world."""
         return replace(self, cam_from_world=tuple(pose @ world_from_new for pose in self.cam_from_world))
 
@@ -71,7 +71,7 @@ def cameras_beside(
         for one, other in pairs
         if one in frame.cameras and other in frame.cameras
     ]
-    images = sorted({image for pair in together for image in pair}, key=_in_order(located, found.rig.names))
+    images = sorted({image for pair in together for image in pair}, key=_capture_order(located, found.rig.names))
     place = {image: number for number, image in enumerate(images)}
     apart = [np.linalg.norm(np.diff([found.rig[name].centre_in_rig for name in pair], axis=0)) for pair in pairs]
     return Compared(
@@ -85,7 +85,7 @@ def cameras_beside(
     )
 
 
-def _in_order(frames: Sequence[Frame], cameras: Sequence[str]) -> Callable[[tuple[str, str]], tuple[int, int]]:
+def _capture_order(frames: Sequence[Frame], cameras: Sequence[str]) -> Callable[[tuple[str, str]], tuple[int, int]]:
     """Sorts images, each by the names of its frame and its camera, in order of capture."""
     frame_of = {frame.name: number for number, frame in enumerate(frames)}
     return lambda image: (frame_of[image[0]], cameras.index(image[1]))

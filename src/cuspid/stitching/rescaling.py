@@ -63,7 +63,10 @@ def rescale_panorama(panorama: Panorama, distances: Sequence[MeasuredDistance]) 
         panorama,
         mm_per_px=factor * (panorama.mm_per_px or 1.0),
         height_mm=height,
-        notes=(*_notes(panorama, factor, measured, fitted), *(note for note in panorama.notes if not _on_scale(note))),
+        notes=(
+            *_notes(panorama, factor, measured, fitted),
+            *(note for note in panorama.notes if not _is_scale_note(note)),
+        ),
     )
     return Rescaled(panorama=new, factor=factor, lengths_mm=fitted)
 
@@ -120,6 +123,6 @@ def _notes(
     return (scale, *apart, *flat)
 
 
-def _on_scale(note: str) -> bool:
+def _is_scale_note(note: str) -> bool:
     """Whether a note tells what the scale was from."""
     return note.startswith("the scale ")

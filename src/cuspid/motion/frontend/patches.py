@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from cuspid.geometry import Rigid3, unit
 from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.model.mesh import Mesh
-from cuspid.model.reconstruction import Reconstruction, Tracks, chosen_tracks, joined_tracks
+from cuspid.model.reconstruction import Reconstruction, Tracks, concatenate_tracks, select_tracks
 from cuspid.model.sparse_model import SparseModel
 from cuspid.motion.frontend.tracks import points_across
 from cuspid.runtime.kernels import kernel
@@ -343,7 +343,7 @@ class _Scene(NamedTuple):
         good = correlation > options.correlation
         return facets.points[good], np.full(int(good.sum()), there), pixels[good]
 
-    def followed_from(
+    def follow_from(
         self, pictures: Mapping[int, Float32[np.ndarray, "h w"]], start: tuple[int, Int[np.ndarray, "k"]]
     ) -> list[tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"], Float[np.ndarray, "_ 2"]]]:
         """Of an image some observations, and where their points are found in those near it: points, images, pixels."""
@@ -371,7 +371,7 @@ class _Scene(NamedTuple):
             pictures |= dict(zip(new, read_now, strict=True))
             pictures = {image: pictures[image] for image in near}
             mine = [own[self.image_index[own] == image] for image in block]
-            follow = partial(self.followed_from, pictures)
+            follow = partial(self.follow_from, pictures)
             found += chain.from_iterable(map_in_threads(follow, zip(block, mine, strict=True)))
             progress("patches", block[-1] + 1, count)
         point, image_index, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
@@ -411,7 +411,7 @@ def follow_points(
     views = _Views.of(names, np.arange(len(names)), (model.camera,) * len(names), tuple(model.cam_from_world.values()))
     scene = _Scene(views, tracks, tracks.frame_index, surface, options)
     point, frame, pixels = scene.follow_all(read, progress)
-    return _with_observations(tracks, point, frame, np.zeros_like(frame), pixels)
+    return _replace_observations(tracks, point, frame, np.zeros_like(frame), pixels)
 
 
 def follow_rig_points(
@@ -444,10 +444,10 @@ def follow_rig_points(
 
     scene = _Scene(views, tracks, image_index.reshape(-1), surface, options)
     point, seen_in, pixels = scene.follow_all(image, progress)
-    return _with_observations(tracks, point, frame_of[seen_in], camera_of[seen_in], pixels)
+    return _replace_observations(tracks, point, frame_of[seen_in], camera_of[seen_in], pixels)
 
 
-def _with_observations(
+def _replace_observations(
     tracks: Tracks,
     point: Int[np.ndarray, "m"],
     frame: Int[np.ndarray, "m"],
@@ -456,10 +456,10 @@ def _with_observations(
 ) -> Tracks:
     """The points of tracks with other observations, if they have any."""
     other = replace(tracks, point_index=point, frame_index=frame, camera_index=camera, pixels=pixels)
-    return chosen_tracks(other, np.ones(len(point), bool))
+    return select_tracks(other, np.ones(len(point), bool))
 
 
-def hold_together(tracks: Tracks, frames: int, least: int) -> bool:
+def are_connected(tracks: Tracks, frames: int, least: int) -> bool:
     """Whether at least so many points hold each of the frames, and what lies before it and behind."""
     held = np.bincount(tracks.frame_index, minlength=frames)
     across = points_across(tracks.point_index, tracks.frame_index, frames)
@@ -475,4 +475,4 @@ def lengthen(
 ) -> SparseModel:
     """The model of one camera with a second track (:func:`follow_points`) for each point whose patch was found."""
     second = follow_points(model, read, options, progress=progress)
-    return replace(model, tracks=joined_tracks(model.tracks, second))
+    return replace(model, tracks=concatenate_tracks(model.tracks, second))

@@ -55,7 +55,7 @@ def _blocks(surface: Surface, pose: Rigid3, distance_mm: float) -> _Blocks:
     return set(map(tuple, blocks.tolist()))
 
 
-def _shared_part(one: _Blocks, other: _Blocks) -> float:
+def _shared_fraction(one: _Blocks, other: _Blocks) -> float:
     """The part of the smaller surface that both share."""
     return len(one & other) / max(min(len(one), len(other)), 1)
 
@@ -71,7 +71,7 @@ def neighbours(
     to a pose adds up along a path; pairs of one pass and another stay where these come closest.
     """
     blocks = [_blocks(surface, pose, distance_mm) for surface, pose in zip(surfaces, poses, strict=True)]
-    shared = np.array([[_shared_part(one, other) for other in blocks] for one in blocks])
+    shared = np.array([[_shared_fraction(one, other) for other in blocks] for one in blocks])
     np.fill_diagonal(shared, 0.0)
     through_third = np.array([np.minimum(one, shared).max(axis=1) for one in shared])
     found = (shared > min_overlap) & (shared >= through_third)
@@ -92,14 +92,14 @@ def lay_together(
     found, laid = list(poses), list[Correspondences | None]()
     for number in range(rounds):
         laid = map_in_threads(partial(_compare_surfaces, some, surfaces, found, distance_mm), pairs)
-        step = _step(_in_world(pairs, laid, found), len(found))
+        step = _step(_pairs_in_world(pairs, laid, found), len(found))
         found = [pose @ small_motion(motion).inverse() for pose, motion in zip(found, step, strict=True)]
         progress("adjustment", number + 1, rounds)
         if np.abs(step[:, 3:]).max() < _CONVERGED * distance_mm:
             break
     progress("adjustment", rounds, rounds)
     scatter = float(np.mean([each.sigma for each in laid if each is not None] or [0.0]))
-    return found, scatter, _expected_error(some, _in_world(pairs, laid, found), found, distance_mm)
+    return found, scatter, _expected_error(some, _pairs_in_world(pairs, laid, found), found, distance_mm)
 
 
 def _compare_surfaces(
@@ -118,7 +118,7 @@ _Pair = tuple[int, int, Correspondences]
 """Two frames, and how the surface of the first lies on that of the second, in the world."""
 
 
-def _in_world(
+def _pairs_in_world(
     pairs: Sequence[tuple[int, int]], laid: Sequence[Correspondences | None], poses: Sequence[Rigid3]
 ) -> list[_Pair]:
     """The pairs that lie on each other."""

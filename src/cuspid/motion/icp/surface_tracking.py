@@ -127,7 +127,7 @@ def _register_icp(
     return _Step(pose, match_point_to_plane(one, other, pose, reaches[-1], distance_mm))
 
 
-def _doubt(step: _Step, overlap: float, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
+def _rejection_reason(step: _Step, overlap: float, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
     """Why a frame must not be placed so; None if it may be."""
     laid = step.laid
     if laid is None or laid.share < overlap:
@@ -167,7 +167,7 @@ def _track_frame(
     for number, earlier in enumerate(list(placed)[: -_BRIEFLY - 1 : -1]):
         starts = _starts(motion, distance_mm)
         step = _register_from_starts(surfaces, earlier, frame, starts, options, distance_mm)
-        doubt = _doubt(step, options.min_overlap, options, distance_mm)
+        doubt = _rejection_reason(step, options.min_overlap, options, distance_mm)
         if doubt is None:
             return step.this_from_other @ placed[earlier], ""
         reason = doubt if number == 0 else reason
@@ -241,7 +241,7 @@ def _join_pieces(
     number = 0
     while number < len(left):
         progress("lost pieces", len(pieces) - len(left) + number, len(pieces))
-        found = _found_on(surfaces, placed, left[number], options, distance_mm)
+        found = _relocate_piece(surfaces, placed, left[number], options, distance_mm)
         if found:
             placed |= found
             del left[number]
@@ -251,7 +251,7 @@ def _join_pieces(
     return placed
 
 
-def _found_on(
+def _relocate_piece(
     surfaces: Sequence[Surface],
     placed: Mapping[int, Rigid3],
     piece: Mapping[int, Rigid3],
@@ -264,19 +264,19 @@ def _found_on(
     for frame, pose in piece.items():
         for earlier in sorted(placed, key=lambda each: abs(each - frame)):
             tried = _register_icp(few[earlier], surfaces[frame], Rigid3.identity(), distance_mm)
-            if _doubt(tried, options.min_overlap, options, distance_mm) is not None:
+            if _rejection_reason(tried, options.min_overlap, options, distance_mm) is not None:
                 continue
             step = _register_from_starts(surfaces, earlier, frame, [tried.this_from_other], options, distance_mm)
-            if _doubt(step, overlap, options, distance_mm) is not None:
+            if _rejection_reason(step, overlap, options, distance_mm) is not None:
                 continue
             found = pose.inverse() @ step.this_from_other @ placed[earlier]
             there = {each: its @ found for each, its in piece.items()}
-            if _is_borne_out(surfaces, placed, there, overlap, options, distance_mm):
+            if _verify_with_neighbours(surfaces, placed, there, overlap, options, distance_mm):
                 return there
     return {}
 
 
-def _is_borne_out(
+def _verify_with_neighbours(
     surfaces: Sequence[Surface],
     placed: Mapping[int, Rigid3],
     there: Mapping[int, Rigid3],
@@ -294,7 +294,7 @@ def _is_borne_out(
         _register_icp(surfaces[a], surfaces[b], there[b] @ placed[a].inverse(), distance_mm, _REACHES[-_LAST_STEPS:])
         for a, b in witnesses
     )
-    agree = [_doubt(step, overlap, options, distance_mm) is None for step in steps]
+    agree = [_rejection_reason(step, overlap, options, distance_mm) is None for step in steps]
     return len(agree) >= _LEAST_WITNESSES and sum(agree) >= _AGREED * len(agree)
 
 

@@ -237,7 +237,7 @@ def model_size(model: ColmapModel) -> tuple[int, int]:
     return int(model.num_reg_images()), int(model.compute_num_observations())
 
 
-def placed_images(model: ColmapModel) -> list[int]:
+def located_images(model: ColmapModel) -> list[int]:
     """Numbers of the photographs, from 0, that a model places."""
     return [int(identifier) - 1 for identifier in model.reg_image_ids()]
 

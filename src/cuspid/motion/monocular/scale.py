@@ -176,7 +176,7 @@ def scale_by_board(model: PhotoModel, sightings: Sequence[BoardSighting], board:
             f"{what} is seen in {len(sightings)} of {photographs} photographs, but {len(located)} of these could be "
             "located; it takes two, from different places"
         )
-    numbered = _in_one_numbering(model, located, board)
+    numbered = _unify_numbering(model, located, board)
     corner, points = _corners(model, numbered)
     if len(corner) < _LEAST_CORNERS:
         raise ReconstructionError(
@@ -216,7 +216,7 @@ def _corners(
     return np.array(list(found), dtype=np.int64), np.array(list(found.values())).reshape(-1, 3)
 
 
-def _in_one_numbering(model: PhotoModel, sightings: Sequence[BoardSighting], board: Board) -> list[BoardSighting]:
+def _unify_numbering(model: PhotoModel, sightings: Sequence[BoardSighting], board: Board) -> list[BoardSighting]:
     """Sightings of a chessboard, whose corners are not told apart, numbered as in the first one."""
     orders = board.orders
     if len(orders) == 1:

@@ -53,7 +53,7 @@ def _part(part: Panorama, folder: Path) -> dict[str, Any]:
     height, width = part.covered.shape
     return {
         "title": "The arch from above" if part.parts == 1 else f"Part {part.part} of {part.parts}",
-        "picture": jpeg_uri(_on_ground(part.image, part.covered), widest_px=_WIDEST_PX),
+        "picture": jpeg_uri(_fill_background(part.image, part.covered), widest_px=_WIDEST_PX),
         "caption": f"{width} × {height} px",
         "width_px": width,
         "mm_per_px": part.mm_per_px,
@@ -81,7 +81,7 @@ _STRIPS = {
 }
 
 
-def _on_ground(image: UInt8[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+def _fill_background(image: UInt8[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.where(covered[..., None], image, _GROUND)
 
 

@@ -61,7 +61,7 @@ class CrownPoints:
         """Whether two cameras see each of some points from each of several poses, given relative to one pose."""
         cameras = handpiece.rig.cameras.values()
         seen = np.empty((len(pose_from_rig), len(which)), dtype=np.bool_)
-        _seen_by_two(
+        _mark_seen_by_two(
             *(self.points[which], self.normals[which], self.open[which], self.nearest),
             compose_motions(pose_from_rig, rig_from_world),
             compose_motions([each.cam_from_rig for each in cameras], Rigid3.identity()),
@@ -120,7 +120,7 @@ def _nearest_table(directions: Float[np.ndarray, "d 3"]) -> Int[np.ndarray, "lat
 
 @kernel
 @no_type_check
-def _seen_by_two(points, normals, open_, nearest, poses, cameras, bounds, depths, seen):
+def _mark_seen_by_two(points, normals, open_, nearest, poses, cameras, bounds, depths, seen):
     latitudes, longitudes = nearest.shape
     near, inside, own = np.empty(len(points), np.int64), np.empty(len(points), np.bool_), np.empty((3, len(points)))
     counts = np.empty(len(points), np.int64)
@@ -131,7 +131,7 @@ def _seen_by_two(points, normals, open_, nearest, poses, cameras, bounds, depths
         found = _within(points, eyes, longest, near, own)
         counts[:] = 0
         for c in range(len(eyes)):
-            _in_image(own, found, rotations[c], translations[c], bounds[c], depths, inside)
+            _mark_in_image(own, found, rotations[c], translations[c], bounds[c], depths, inside)
             x, y, z = eyes[c]
             for i in range(found):
                 n = near[i]
@@ -185,7 +185,7 @@ def _within(points, eyes, longest, near, own):
 
 @kernel
 @no_type_check
-def _in_image(own, found, r, t, bounds, depths, inside):
+def _mark_in_image(own, found, r, t, bounds, depths, inside):
     """Which of the points lie in an image and in focus: without branches, so that several are computed at once."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = r.ravel()
     t0, t1, t2 = t

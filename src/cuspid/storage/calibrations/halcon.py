@@ -18,7 +18,7 @@ from cuspid.runtime.errors import InputError
 from cuspid.runtime.values import checked_name, number, quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, vector
-from cuspid.storage.calibrations.lenses import Lens, Loss, of_projection
+from cuspid.storage.calibrations.lenses import Lens, Loss, fit_projection
 
 LENSES: tuple[Lens, ...] = ()
 _FIELD = re.compile(r"^\s*([A-Za-z]\w*)\s*:\s*\w+\s*:\s*([^;:]+?)\s*;", re.MULTILINE)
@@ -74,11 +74,11 @@ def _camera(what: str, text: str) -> tuple[Camera, Loss | None]:
         return pinhole, None
     if "Kappa" in told:
         kappa = number(f"{what}: Kappa", told["Kappa"], -1e12, 1e12) * focus**2
-        return of_projection(lambda points: _distort_division(kappa, pinhole, points), size, "the division model")
+        return fit_projection(lambda points: _distort_division(kappa, pinhole, points), size, "the division model")
     k1, k2, k3, p1, p2 = (told[each] for each in _POLYNOMIAL)
     values = [k1 * focus**2, k2 * focus**4, p2 * focus, p1 * focus, k3 * focus**6, 0.0, 0.0, 0.0]
     inverse = camera(what, size, focal, centre, values, "FULL_OPENCV")
-    return of_projection(lambda points: _invert_division(inverse, points), size, "the polynomial model")
+    return fit_projection(lambda points: _invert_division(inverse, points), size, "the polynomial model")
 
 
 def _plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:

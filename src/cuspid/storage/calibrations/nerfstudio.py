@@ -25,7 +25,7 @@ from cuspid.storage.calibrations.fields import (
     require_list,
     require_mapping,
 )
-from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, Lens, Loss, of_projection
+from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, Lens, Loss, fit_projection
 
 LENSES: tuple[Lens, ...] = (BROWN_5, FISHEYE)
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
@@ -108,7 +108,7 @@ def _camera(what: str, told: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
         more = k4 * (plane**2).sum(axis=1, keepdims=True) ** 4 * plane * made.focal_px
         return np.where(np.isfinite(plane), made.project(points) + more, np.nan)
 
-    return of_projection(project, size, "k4 of a perspective lens")
+    return fit_projection(project, size, "k4 of a perspective lens")
 
 
 def write(cameras: Mapping[str, MountedCamera], suffix: str) -> str:

@@ -31,7 +31,7 @@ from cuspid.storage.calibrations.fields import (
     require_mapping,
     vector,
 )
-from cuspid.storage.calibrations.lenses import FISHEYE, RATIONAL, Lens, Loss, of_projection
+from cuspid.storage.calibrations.lenses import FISHEYE, RATIONAL, Lens, Loss, fit_projection
 
 LENSES: tuple[Lens, ...] = (RATIONAL, FISHEYE)
 _MEANINGS = {
@@ -183,7 +183,7 @@ def _camera(what: str, found: Mapping[str, Any], hints: Hints) -> tuple[Camera, 
     if np.any(given[8:]):
         model, parameters = brown(given[:8])
         plain = camera(what, size, focal, centre, parameters, model)
-        made, loss = of_projection(lambda points: _prism(plain, given, points), size, f"{len(given)} coefficients")
+        made, loss = fit_projection(lambda points: _prism(plain, given, points), size, f"{len(given)} coefficients")
         return made, loss, note
     model, parameters = brown(given[:8])
     return camera(what, size, focal, centre, parameters, model), None, note

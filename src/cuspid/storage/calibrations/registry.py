@@ -199,7 +199,7 @@ class CarriedOver:
     """What else is left out."""
 
 
-def carried_over(rig: Rig, kind: Name) -> CarriedOver:
+def fit_to_format(rig: Rig, kind: Name) -> CarriedOver:
     """What a format can hold of a rig. Raises OutputError where that is too little."""
     format = FORMATS[kind]
     if format.write is None and kind != "handpiece":

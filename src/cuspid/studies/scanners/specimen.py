@@ -143,7 +143,7 @@ class Specimen:
         return tuple(piece for piece in order if piece in there)
 
 
-def guessed_unit(path: Path, mesh: Mesh, like_mm: float | None = None) -> tuple[Unit, str | None]:
+def guess_unit(path: Path, mesh: Mesh, like_mm: float | None = None) -> tuple[Unit, str | None]:
     """The unit of a file whose mesh was read in mm, by its size, which is that of teeth or jaws, or nearly ``like_mm``
     where that is known; and what is odd about it. Raises InputError where no unit fits."""
     file = MeasuredFile(path=path, mesh=mesh, unit="mm")
@@ -172,7 +172,7 @@ def load_specimen(
     align_teeth: tuple[int, ...] = (),
 ) -> Specimen:
     """The reference of a specimen and what lies beside it. Raises InputError where it cannot be used."""
-    read_in, odd = (unit, None) if unit is not None else guessed_unit(path, storage.read_mesh(path))
+    read_in, odd = (unit, None) if unit is not None else guess_unit(path, storage.read_mesh(path))
     jaw, occlusal_from_file, notes = _load_reference(path, read_in, arch, labelling)
     mesh, mm = jaw.mesh, MM_PER_UNIT[read_in]
     area = _area_of(path, jaw, occlusal_from_file, read_in, align_teeth)
@@ -342,7 +342,7 @@ def _bodies_of(
     if table is None or library is None:
         return None, {}, ()
     read = storage.read_mesh(library)
-    unit, _ = guessed_unit(library, read, like_mm=8.0)
+    unit, _ = guess_unit(library, read, like_mm=8.0)
     body, _ = mend_faces(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     surface = SignedDistance(body)
     found, notes = {}, []

@@ -97,7 +97,7 @@ def prepare(
     wanted = [scan for scan in files.scans if scan.specimen in made]
     if not wanted:
         raise InputError(f"{given}: no specimen can be used: {'; '.join(map(str, lost[:3]))}")
-    keys = {scan.key: _made_from(scan, digests, made, options) for scan in wanted}
+    keys = {scan.key: _provenance_of(scan, digests, made, options) for scan in wanted}
     _measure(wanted, keys, out, options, workers, cluster, retry_failed, progress)
     told = {scan.key: storage.read_json(_record(out, scan.key)) for scan in wanted}
     failed = [
@@ -142,7 +142,7 @@ def compare(prepared: Prepared, out: Path, options: StudyOptions, progress: Prog
     )
 
 
-def foreseen(prepared: Prepared, out: Path, options: StudyOptions) -> tuple[Remark, ...]:
+def plan_comparison(prepared: Prepared, out: Path, options: StudyOptions) -> tuple[Remark, ...]:
     """All that is odd about scans that were prepared, before they are compared."""
     found = coverage_remarks(partial(specimen_of, out), prepared.scans, out / "scans", options)
     return (*prepared.remarks, *found)
@@ -225,7 +225,7 @@ def _record(out: Path, key: str) -> Path:
     return out / "scans" / f"{key}.json"
 
 
-def _made_from(
+def _provenance_of(
     scan: ScanFile, digests: Mapping[str, str], specimens: Mapping[str, str], options: StudyOptions
 ) -> tuple[str, str]:
     """The digest of a scan's file, and what identifies what is kept of it."""
