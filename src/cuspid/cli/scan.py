@@ -114,8 +114,7 @@ def reconstruct(
         from_poses: Folder of a COLMAP model whose poses are used instead of finding them.
     """
     if storage.is_photographs(capture, handpiece):
-        given = reconstruction, photographs, scale, from_poses
-        reconstruct_photographs(capture, out, handpiece, *given)
+        reconstruct_photographs(capture, out, handpiece, reconstruction, photographs, scale, from_poses)
         return
     if scale != PhotoScaleOptions():
         raise InputError("--square-mm and --distance are for photographs of one camera; a handpiece knows the scale")

@@ -75,9 +75,8 @@ def measure_moving_cameras(
         if name not in images or name not in next_images or pair is None:
             continue
         both = {name: images[name], moved: next_images[name]}
-        views = prepare_views(
-            *(pair, {name: (moved,), moved: (name,)}, handpiece.working_distance_mm, handpiece.depth_range_mm, stereo)
-        )
+        sources = {name: (moved,), moved: (name,)}
+        views = prepare_views(pair, sources, handpiece.working_distance_mm, handpiece.depth_range_mm, stereo)
         measured = measure_views(views, both, handpiece.depth_range_mm, resolution, stereo, widenings=())
         found += depth_maps_of(views, measured, both, masks, frame, resolution, stereo.confidence, stereo.grid_px)
     return tuple(_discount_weight(depth_map, options.confidence_share) for depth_map in found)

@@ -315,7 +315,12 @@ class DepthEstimator:
                 measured = self._measure_shading(views, images, lighting)
             else:
                 measured = measure_views(
-                    *(views, images, self.handpiece.depth_range_mm, self.resolution, self.options, work),
+                    views,
+                    images,
+                    self.handpiece.depth_range_mm,
+                    self.resolution,
+                    self.options,
+                    work,
                     widenings=() if self.handpiece.lights else WIDENINGS,
                 )
             maps = depth_maps_of(

@@ -452,9 +452,8 @@ def shaded_depths(
     blurred = np.stack([_masked_blur(image, options.blur_px) for image in images])
     compared_of = _ratios if _are_coloured(views[0].lights) else _intensities
     compared, trust = compared_of(blurred, np.ones_like(blurred))
-    how = depth_range_mm, spacing_px, options
     refinements = [
-        _Refinement(compared, hue, index, view, *how)
+        _Refinement(compared, hue, index, view, depth_range_mm, spacing_px, options)
         for index, (view, hue) in enumerate(zip(views, _hues(blurred), strict=True))
     ]
     found = [each.refine(compared, trust, _LENIENT) for each in refinements]

@@ -129,10 +129,10 @@ def measure_enough_depth(
     sightings = Sightings.of(found, found.tracks)
     missing = sightings.count_confirmations(depths, found.rig_from_world, agreement_mm) < _ENOUGH_MAPS
     between = _unmeasured_frames(capture, set(every_second), sightings, missing, left_share, options)
-    return depths | measure_depth(
-        *(replace(capture, frames=between), folder, options),
-        progress=lambda _, done, total: progress("more depth", done, total),
+    more = measure_depth(
+        replace(capture, frames=between), folder, options, progress=lambda _, *of: progress("more depth", *of)
     )
+    return depths | more
 
 
 def _select_every_second(frames: Sequence[Frame]) -> tuple[Frame, ...]:

@@ -244,7 +244,7 @@ class _RigScene:
         surface = shown.dense.mesh().transformed(into_occlusal_frame(self.path, shown.motion).inverse())
         options = self.options
         return refine_rig_on_surface(
-            *(self.found, surface, self.capture, options.rig, options.motion, options.rig_patches), progress=progress
+            self.found, surface, self.capture, options.rig, options.motion, options.rig_patches, progress=progress
         )
 
 

@@ -238,9 +238,15 @@ def surface(
     else:
         depths = _textured_depth(of_size, found, detail, folder, options, progress)
     trim_heap()
-    how = fusion_for(of_size.handpiece, options), options.cleaning, options.sharp_edges
     return fuse(
-        *(depths, depths.digest, _poses(found, depths), detail, folder, *how),
+        depths,
+        depths.digest,
+        _poses(found, depths),
+        detail,
+        folder,
+        fusion_for(of_size.handpiece, options),
+        options.cleaning,
+        options.sharp_edges,
         expected=found.expectation,
         has_scale=found.has_scale,
         progress=progress,
@@ -302,7 +308,10 @@ def _textured_depth(
         return measure_view_depth(capture, found, folder / "depth", stereo, progress=progress)
     agreement_mm = options.fusion.agreement * detail
     depths = measure_enough_depth(
-        *(capture, found, folder / "depth", stereo),
+        capture,
+        found,
+        folder / "depth",
+        stereo,
         agreement_mm=agreement_mm,
         left_share=options.left_share,
         progress=progress,
@@ -311,10 +320,15 @@ def _textured_depth(
         return depths
     holes = None
     if found.tracks is not None and options.across.small_holes is not False and options.across.left_share != 0:
-        located = depths, depths.digest, _poses(found, depths)
-        holes = find_holes(*located, detail, folder, fusion_for(handpiece, options), progress=progress)
+        poses, fusion = _poses(found, depths), fusion_for(handpiece, options)
+        holes = find_holes(depths, depths.digest, poses, detail, folder, fusion, progress=progress)
     return depths | measure_depth_across(
-        *(capture, found, depths, folder / "depth-across", options.across, stereo),
+        capture,
+        found,
+        depths,
+        folder / "depth-across",
+        options.across,
+        stereo,
         agreement_mm=agreement_mm,
         min_maps=options.fusion.min_maps,
         holes=holes,

@@ -94,10 +94,15 @@ class Scene:
         mesh = self.jaw.mesh
         marks = natural_marks(self.jaw, self.seed) if self.appearance.marked else no_marks(mesh)
         return ShadedMesh(
-            mesh.vertices,
-            read_only(mesh.faces),  # arrays from another process are writable: the shading would be compiled once more
-            *(mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw)),
-            *(marks.colours, marks.shares, marks.stippled),
+            vertices=mesh.vertices,
+            # Arrays from another process are writable: the shading would be compiled once more.
+            faces=read_only(mesh.faces),
+            face_normals=mesh.face_normals,
+            vertex_normals=mesh.vertex_normals,
+            materials=face_materials(self.jaw),
+            mark_colours=marks.colours,
+            marks=marks.shares,
+            stippled=marks.stippled,
         )
 
     @computed_once
@@ -259,8 +264,8 @@ def radiance_along(
         bottom = min(top + rows, height)
         own, firsts = slice(top * row, bottom * row), slice(top * row, (bottom + 1) * row, samples)
         grid = trace(scene.jaw.mesh, _slice_origins(origins, firsts), directions[firsts])
-        given = scene.jaw.mesh, scene.surface, _slice_origins(origins, own), directions[own]
-        rays = first_hits(*given, grid, samples, width, moving=moving)
+        begins = _slice_origins(origins, own)
+        rays = first_hits(scene.jaw.mesh, scene.surface, begins, directions[own], grid, samples, width, moving=moving)
         _add_light(scene, rays, grid, lights, below, out[top:bottom])
     return out
 
@@ -284,10 +289,8 @@ def _add_light(
     points, materials = _places(rays, scene.surface)
     albedos = albedo(points, materials, scene.palette)
     _mark(rays, scene.surface, albedos)
-    _shade(
-        *(rays, albedos, scene.surface, scene.palette, lights),
-        *(chosen, counts, light, samples, below, out.reshape(-1, 3)),
-    )
+    pixels = out.reshape(-1, 3)
+    _shade(rays, albedos, scene.surface, scene.palette, lights, chosen, counts, light, samples, below, pixels)
 
 
 @kernel
@@ -401,8 +404,8 @@ def _shade(rays, albedos, surface, palette, lights, chosen, counts, light, sampl
             for k in range(len(lights.positions)):
                 if light.lit[n, k]:
                     towards, falloff = incoming(point, k, lights)
-                    surface_coat = palette.reflectance[m], palette.roughness[m], palette.saliva
-                    diffuse, glossy = _reflect(normal, view, towards, *surface_coat)
+                    reflectance, roughness = palette.reflectance[m], palette.roughness[m]
+                    diffuse, glossy = _reflect(normal, view, towards, reflectance, roughness, palette.saliva)
                     glossy *= lights.glare[k]
                     if spread:
                         diffuse = 0.0
@@ -542,8 +545,8 @@ class _Worker:
 
     def __call__(self, task: tuple[Frame, str]) -> tuple[str, str]:
         frame, camera = task
-        how = self.poses[frame.name], self.gains[frame.lighting], self.motions[frame.name]
-        self.sink(frame.name, camera, render_image(self.scene, frame, camera, *how))
+        pose, gain, motion = self.poses[frame.name], self.gains[frame.lighting], self.motions[frame.name]
+        self.sink(frame.name, camera, render_image(self.scene, frame, camera, pose, gain, motion))
         return frame.name, camera
 
 

@@ -83,8 +83,7 @@ def simulate(
     true, known = sample_built(handpiece, options.manufacturing), with_tolerances(handpiece, options.manufacturing)
     _check(true, options)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
-    overlaps = path.min_overlap, path.mean_overlap
-    write_path(folder / "truth" / "path.json", *overlaps, path.seen, path.cross_sweep)
+    write_path(folder / "truth" / "path.json", path.min_overlap, path.mean_overlap, path.seen, path.cross_sweep)
     return take_images(
         jaw,
         true,

@@ -217,10 +217,8 @@ def align_patches(
     """
     shifts, correlations = np.empty_like(there_px), np.empty(len(there_px))
     start = np.ascontiguousarray(there_px - OPENCV_PIXEL_OFFSET)
-    _align(
-        *(patches, picture, start, np.ascontiguousarray(warps), np.ascontiguousarray(bends_px)),
-        *(options.limit_px, options.iterations, shifts, correlations),
-    )
+    warps, bends_px = np.ascontiguousarray(warps), np.ascontiguousarray(bends_px)
+    _align(patches, picture, start, warps, bends_px, options.limit_px, options.iterations, shifts, correlations)
     return there_px + shifts, correlations
 
 

@@ -62,7 +62,10 @@ class CrownPoints:
         cameras = handpiece.rig.cameras.values()
         seen = np.empty((len(pose_from_rig), len(which)), dtype=np.bool_)
         _mark_seen_by_two(
-            *(self.points[which], self.normals[which], self.open[which], self.nearest),
+            self.points[which],
+            self.normals[which],
+            self.open[which],
+            self.nearest,
             compose_motions(pose_from_rig, rig_from_world),
             compose_motions([each.cam_from_rig for each in cameras], Rigid3.identity()),
             np.array([np.concatenate(slope_bounds(each.camera)) for each in cameras]),
