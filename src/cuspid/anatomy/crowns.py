@@ -90,8 +90,8 @@ def crowns_by_shape(mesh: Mesh) -> Bool[np.ndarray, "f"]:
 
 def _simplify(mesh: Mesh, face_mm2: float) -> Mesh:
     """With faces of that mean area, or the mesh itself where its own are about as large."""
-    wanted = max(int(mesh.face_areas.sum() / face_mm2), 100)
-    return mesh if len(mesh.faces) <= 1.3 * wanted else mesh.simplified(wanted)
+    face_count = max(int(mesh.face_areas.sum() / face_mm2), 100)
+    return mesh if len(mesh.faces) <= 1.3 * face_count else mesh.simplified(face_count)
 
 
 # --- how places look --------------------------------------------------------------------------------------------------

@@ -140,11 +140,11 @@ def _read_by_numbers(
             f"{source}: tooth labels {_abbreviate(values)} are {what} numbers; give --label-map, a JSON file of each "
             "label and its FDI number"
         )
-    told = _arch_of(table[value] for value in values)
-    if arch is not None and told is not None and told != arch:
+    labelled_arch = _arch_of(table[value] for value in values)
+    if arch is not None and labelled_arch is not None and labelled_arch != arch:
         raise InputError(
-            f"{source}: its labels {_abbreviate(values)}, read as {_NAMES[numbering]} numbers, are {told} teeth, but "
-            f"its name or --arch says {arch}; give the right --arch or --labels, or --label-map"
+            f"{source}: its labels {_abbreviate(values)}, read as {_NAMES[numbering]} numbers, are {labelled_arch} "
+            f"teeth, but its name or --arch says {arch}; give the right --arch or --labels, or --label-map"
         )
     return Numbered(labels=_map_labels(labels, table))
 
@@ -160,8 +160,8 @@ def _abbreviate(values: tuple[int, ...]) -> str:
             runs[-1][1] = value
         else:
             runs.append([value, value])
-    told = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
-    return ", ".join(told[:5]) + (" ..." if len(told) > 5 else "")
+    ranges = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
+    return ", ".join(ranges[:5]) + (" ..." if len(ranges) > 5 else "")
 
 
 def _arch_of(fdi: Iterator[int]) -> Arch | None:
@@ -281,8 +281,8 @@ def _unambiguous_reading(readings: list[_Reading]) -> _Reading | None:
 
 
 def _numbered_with_note(labels: Int[np.ndarray, "f"], reading: _Reading) -> Numbered:
-    there = set(_values(labels))
-    fdi = [each for _, each in sorted(reading.fdi().items()) if each in there]
+    present = set(_values(labels))
+    fdi = [each for _, each in sorted(reading.fdi().items()) if each in present]
     note = f"labels: read as {reading} (FDI {fdi[0]} to {fdi[-1]}), as the teeth stand; --label-map overrules that"
     return Numbered(labels=labels, notes=(note,))
 

@@ -297,21 +297,21 @@ def _fit_arch(
     """Lay an arch on the crowns from a start ``angle``: misfit in mm (0 to 4), and where its front points."""
     arch = arch - arch.mean(axis=0)
     c, s = np.cos(angle), np.sin(angle)
-    laid = arch @ np.array([[c, s], [-s, c]]) + places.mean(axis=0)
+    fitted = arch @ np.array([[c, s], [-s, c]]) + places.mean(axis=0)
     tree = cKDTree(places)
     for _ in range(20):
-        beside, from_places = cKDTree(laid).query(places)
-        far, to_places = tree.query(laid)
+        beside, from_places = cKDTree(fitted).query(places)
+        far, to_places = tree.query(fitted)
         on, near = beside <= np.quantile(beside, _ON_ARCH), far < 6.0
         source = np.concatenate([arch[from_places[on]], arch[near]])
         target = np.concatenate([places[on], places[to_places[near]]])
         weights = np.concatenate([np.full(on.sum(), 1 / on.sum()), np.full(near.sum(), 1 / len(arch))])
-        laid = _apply_similarity(source, target, weights, arch)
-    there, _ = cKDTree(laid).query(places)
-    there = there[there <= np.quantile(there, _ON_ARCH)]
-    back, _ = tree.query(laid)
-    _, rotation, _ = best_similarity(arch, laid, np.ones(len(arch)))
-    misfit = np.minimum(there, 4.0).mean() + np.minimum(back, 4.0).mean()
+        fitted = _apply_similarity(source, target, weights, arch)
+    distances, _ = cKDTree(fitted).query(places)
+    distances = distances[distances <= np.quantile(distances, _ON_ARCH)]
+    back, _ = tree.query(fitted)
+    _, rotation, _ = best_similarity(arch, fitted, np.ones(len(arch)))
+    misfit = np.minimum(distances, 4.0).mean() + np.minimum(back, 4.0).mean()
     return float(misfit / 2), rotation[:, 1]
 
 

@@ -148,13 +148,13 @@ def _is_occlusal(places: _Places, normals: Local) -> Bool[np.ndarray, "n"]:
 
 
 def _rim(
-    turns: Float[np.ndarray, "m"], radius: Float[np.ndarray, "m"], wanted: Float[np.ndarray, "n"]
+    turns: Float[np.ndarray, "m"], radius: Float[np.ndarray, "m"], directions: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
     """Largest radius in each direction (in turns), smoothed around the circle, at the wanted directions."""
     largest = np.zeros(_WEDGES)
     np.maximum.at(largest, np.floor(turns * _WEDGES).astype(int) % _WEDGES, radius)
     smooth = uniform_filter1d(median_filter(largest, 3, mode="wrap"), 3, mode="wrap")
-    return np.interp(wanted, (np.arange(_WEDGES) + 0.5) / _WEDGES, smooth, period=1.0)
+    return np.interp(directions, (np.arange(_WEDGES) + 0.5) / _WEDGES, smooth, period=1.0)
 
 
 def _gum_beside_teeth(jaw: Jaw, reach_mm: float) -> Int[np.ndarray, "n"]:

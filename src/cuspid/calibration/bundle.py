@@ -550,22 +550,22 @@ def adjust_board(
     seen = _Observations.of(views, board, start)
     free = _Free.of(start, seen, board, only_boards=only_boards)
     scene, settled = _minimize(start, seen, free)
-    told = not (only_boards or keep_scales) and (scene.shape is not None or scene.loose_px > 0)
-    for _ in range(_TELLINGS if told else 0):
+    estimate_priors = not (only_boards or keep_scales) and (scene.shape is not None or scene.loose_px > 0)
+    for _ in range(_TELLINGS if estimate_priors else 0):
         before, scene = scene, _update_priors(scene, seen, free, board)
         if _priors_converged(before, scene):
             break
         free = _Free.of(scene, seen, board, only_boards=only_boards)
         scene, settled = _minimize(scene, seen, free)
-    there = _project(scene, seen)
-    pieces = np.split(there.raw, seen.starts[1:-1])
-    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
+    projection = _project(scene, seen)
+    pieces = np.split(projection.raw, seen.starts[1:-1])
+    sigma_px = _scale(_project_out_motions(scene, seen, projection, None)[0])
     return Adjusted(
         scene=scene,
         sigma_px=sigma_px,
         residuals=dict(zip(seen.keys, pieces, strict=True)),
         settled=settled,
-        equations=None if only_boards else _Equations.of(scene, seen, there, sigma_px, free),
+        equations=None if only_boards else _Equations.of(scene, seen, projection, sigma_px, free),
     )
 
 
@@ -577,9 +577,9 @@ def unevenness_score(found: Adjusted, views: Views, board: Board) -> float:
     free = _Free.of(scene, seen, board, only_boards=False)
     of_shape = _mask_of_kind(scene, free, _SHAPES)
     rows = _weigh_equations(scene, seen, _project(scene, seen), found.sigma_px, free)
-    told = np.diag(matrix_of(rows.values, free.layout))[of_shape]
+    information = np.diag(matrix_of(rows.values, free.layout))[of_shape]
     pull = rows.pull[of_shape]
-    return float(np.mean(pull[told > 0] ** 2 / told[told > 0]))
+    return float(np.mean(pull[information > 0] ** 2 / information[information > 0]))
 
 
 def views_in_front(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, str], BoardView]:
@@ -601,11 +601,11 @@ def views_at_middle_rows(scene: BoardScene, views: Views, board: Target) -> dict
 
 def _minimize(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
     """The best scene, and whether another step would not have been worth it."""
-    there = _project(scene, seen)
-    if not there.is_whole:
+    projection = _project(scene, seen)
+    if not projection.is_whole:
         raise ReconstructionError("calibration: a corner of the board lies behind a camera that saw it")
     damping, settled, steps = 1e-4, False, 0
-    here = _Slope.of(scene, seen, there, free)
+    here = _Slope.of(scene, seen, projection, free)
     while not settled and steps < _STEPS and damping < _MOST_DAMPING:
         steps += 1
         step = _solve(here.matrix + damping * np.diag(np.diag(here.matrix)), here.gradient)
@@ -631,37 +631,37 @@ class _Slope:
     gradient: Float[np.ndarray, "k"]
 
     @staticmethod
-    def of(scene: BoardScene, seen: _Observations, there: _Projection, free: _Free) -> _Slope:
+    def of(scene: BoardScene, seen: _Observations, projection: _Projection, free: _Free) -> _Slope:
         """Given where it puts the corners."""
-        sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
-        apart = _project_out_motions(scene, seen, there, sigma_px)
+        sigma_px = _scale(_project_out_motions(scene, seen, projection, None)[0])
+        apart = _project_out_motions(scene, seen, projection, sigma_px)
         cost = _cost_of(scene, *apart, sigma_px, free)
         return _Slope(
-            sigma_px, cost, *_normal(scene, _weigh_equations(scene, seen, there, sigma_px, free, apart), free)
+            sigma_px, cost, *_normal(scene, _weigh_equations(scene, seen, projection, sigma_px, free, apart), free)
         )
 
 
 def _project_out_motions(
     scene: BoardScene,
     seen: _Observations,
-    there: _Projection,
+    projection: _Projection,
     sigma_px: float | None,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "v 6"]]:
     """The residuals without what the board was elsewhere by in each view, and that, px; by a standard deviation of a
     coordinate, or by what it is found to be."""
-    motions, residuals, by_view = np.zeros((len(seen.keys), _PLACE)), there.raw, there.by_view
-    if by_view is None or there.of_motions is None:
+    motions, residuals, by_view = np.zeros((len(seen.keys), _PLACE)), projection.raw, projection.by_view
+    if by_view is None or projection.of_motions is None:
         return residuals, motions
     for _ in range(_LOOSE_ROUNDS):
         sigma, before = _scale(residuals) if sigma_px is None else sigma_px, motions
         odd = 1 - sigma**2 * _weights(residuals, sigma)
-        less, pull = motion_equations(there.raw, by_view, odd, seen.starts)
-        matrix, right = (there.of_motions[0] - less) / sigma**2, (there.of_motions[1] - pull) / sigma**2
+        less, pull = motion_equations(projection.raw, by_view, odd, seen.starts)
+        matrix, right = (projection.of_motions[0] - less) / sigma**2, (projection.of_motions[1] - pull) / sigma**2
         matrix += np.eye(_PLACE) / scene.loose_px**2
         motions = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
         if np.array_equal(motions, before):
             break
-        residuals = without_motions(there.raw, by_view, seen.starts, motions)
+        residuals = without_motions(projection.raw, by_view, seen.starts, motions)
     return residuals, motions
 
 
@@ -701,12 +701,12 @@ def _scale(residuals: Float[np.ndarray, "n 2"]) -> float:
 def _cost(
     scene: BoardScene,
     seen: _Observations,
-    there: _Projection,
+    projection: _Projection,
     sigma_px: float,
     free: _Free,
 ) -> float:
     """Huber loss of the residuals, and the prior; infinite where a corner lies behind a camera."""
-    return _cost_of(scene, *_project_out_motions(scene, seen, there, sigma_px), sigma_px, free)
+    return _cost_of(scene, *_project_out_motions(scene, seen, projection, sigma_px), sigma_px, free)
 
 
 def _cost_of(
@@ -720,9 +720,9 @@ def _cost_of(
     if not np.isfinite(lengths).all():
         return np.inf
     loss = np.where(lengths <= _KNEE, lengths**2, 2 * _KNEE * lengths - _KNEE**2)
-    held = _prior_offset(scene)[free.columns]
+    offset = _prior_offset(scene)[free.columns]
     moved = float(np.sum(motions**2)) / scene.loose_px**2 if scene.loose_px else 0.0
-    return float(loss.sum() + held @ free.prior @ held) + moved
+    return float(loss.sum() + offset @ free.prior @ offset) + moved
 
 
 def _lens_precision(camera: Camera, numbers: int) -> Float[np.ndarray, "n"]:
@@ -800,19 +800,19 @@ class _Rows:
 def _weigh_equations(
     scene: BoardScene,
     seen: _Observations,
-    there: _Projection,
+    projection: _Projection,
     sigma_px: float,
     free: _Free,
     apart: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "v 6"]] | None = None,
 ) -> _Rows:
     """``apart``, if it is known: what :func:`_project_out_motions` returns."""
-    residuals, motions = apart or _project_out_motions(scene, seen, there, sigma_px)
+    residuals, motions = apart or _project_out_motions(scene, seen, projection, sigma_px)
     weights = np.sqrt(_weights(residuals, sigma_px))[:, None]
-    values, weighed = _derivatives(scene, seen, there.in_cam) * weights[:, :, None], residuals * weights
-    if there.by_view is None:
+    values, weighed = _derivatives(scene, seen, projection.in_cam) * weights[:, :, None], residuals * weights
+    if projection.by_view is None:
         spread, between = np.zeros((len(seen.keys), _PLACE, _PLACE)), np.zeros((len(free.layout.unknowns), _PLACE))
         return _Rows(free.layout, values, weighed, None, motions, spread, between)
-    by_motion = there.by_view * weights[:, :, None]
+    by_motion = projection.by_view * weights[:, :, None]
     matrix, _ = motion_equations(weighed, by_motion, np.ones(len(weighed)), seen.starts)
     spread = np.asarray(np.linalg.inv(matrix + np.eye(_PLACE) / scene.loose_px**2))
     between = between_motions(values, by_motion, free.layout)
@@ -830,9 +830,9 @@ class _Equations:
     """Of the normal equations, with what the prior tells."""
 
     @staticmethod
-    def of(scene: BoardScene, seen: _Observations, there: _Projection, sigma_px: float, free: _Free) -> _Equations:
+    def of(scene: BoardScene, seen: _Observations, projection: _Projection, sigma_px: float, free: _Free) -> _Equations:
         """Raises ReconstructionError where the images leave something undetermined."""
-        rows = _weigh_equations(scene, seen, there, sigma_px, free)
+        rows = _weigh_equations(scene, seen, projection, sigma_px, free)
         matrix = rows.matrix + free.prior
         _solve(matrix, np.zeros(len(matrix)))
         return _Equations(seen, free, rows, matrix)
@@ -914,9 +914,9 @@ def _apply_motions(poses: Mapping[_Key, Rigid3], motions: Float[np.ndarray, "k"]
 def _update_priors(scene: BoardScene, seen: _Observations, free: _Free, board: Target) -> BoardScene:
     """The scene with a board as uneven, and views as loose, as the images tell (D. MacKay, Neural Computation 4, 1992,
     equation 3.14)."""
-    there = _project(scene, seen)
-    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
-    rows = _weigh_equations(scene, seen, there, sigma_px, free)
+    projection = _project(scene, seen)
+    sigma_px = _scale(_project_out_motions(scene, seen, projection, None)[0])
+    rows = _weigh_equations(scene, seen, projection, sigma_px, free)
     inverse = _solve(rows.matrix + free.prior, np.eye(len(free.columns)))
     of_shape = _mask_of_kind(scene, free, _SHAPES)
     if scene.shape is not None and of_shape.any():
@@ -928,8 +928,8 @@ def _update_priors(scene: BoardScene, seen: _Observations, free: _Free, board: T
         for view in range(len(seen.keys)):
             unknowns, follow = rows.follow(view)
             unsure += np.sum((follow @ inverse[np.ix_(unknowns, unknowns)]) * follow)
-        told = rows.motions.size - unsure / scene.loose_px**2
-        loose_px = float(np.sqrt(np.sum(rows.motions**2) / max(told, 1e-3)))
+        dof = rows.motions.size - unsure / scene.loose_px**2
+        loose_px = float(np.sqrt(np.sum(rows.motions**2) / max(dof, 1e-3)))
         scene = replace(scene, loose_px=float(np.clip(loose_px, _TIGHT * sigma_px, _LOOSEST * sigma_px)))
     return scene
 
@@ -988,9 +988,9 @@ def readout_score(scene: BoardScene, views: Views, board: Target) -> float:
     """How far a first step from the readouts of a scene would change one of them, in its standard deviations by how
     much the instants disagree."""
     seen = _Observations.of(views, board, scene)
-    free, there, count = _Free.of(scene, seen, board, only_boards=False), _project(scene, seen), len(scene.cameras)
-    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
-    known = _Equations.of(scene, seen, there, sigma_px, free)
+    free, projection, count = _Free.of(scene, seen, board, only_boards=False), _project(scene, seen), len(scene.cameras)
+    sigma_px = _scale(_project_out_motions(scene, seen, projection, None)[0])
+    known = _Equations.of(scene, seen, projection, sigma_px, free)
     by_corners, moved = _camera_covariance(scene, known)
     sigmas = np.sqrt(np.diag(covariance_of(by_corners[-count:, -count:], moved[:, -count:])))
     _, gradient = _normal(scene, known.rows, free)

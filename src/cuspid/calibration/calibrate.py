@@ -209,15 +209,15 @@ def _calibrate_once(
     choices = {name: choice for name, (choice, _) in lenses.items()}
     alone = {name: each for name, (_, each) in lenses.items()}
     cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
-    how: tuple[str, ...] = ()
+    notes_joining: tuple[str, ...] = ()
     if isinstance(board, BoardSet):
-        start, common, how = join_boards(views, board, cameras)
+        start, common, notes_joining = join_boards(views, board, cameras)
     else:
         start, common = join_cameras(views, board, cameras, sorted({instant for _, instant in views}))
 
     def attempt(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
         found, chosen, notes = _fit_cameras(scene, common, board, options)
-        return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes), options.frames_per_s))
+        return _Trial(found, _describe(found, chosen, board, lenses, (*notes_joining, *notes), options.frames_per_s))
 
     best = _with_timing(attempt(start), start, common, board, options, attempt)
     splined = _find_splines(best, choices, board) if options.lens == "auto" else {}
@@ -491,10 +491,10 @@ def size_notes(found: Rig, drawn: Rig, board: Target) -> tuple[str, ...]:
     growth = sizes[0] / max(sizes[1], 1e-9) - 1
     if abs(growth) < _ODD_SIZE:
         return ()
-    how = "farther apart" if growth > 0 else "closer together"
+    direction = "farther apart" if growth > 0 else "closer together"
     return (
-        f"the cameras lie {abs(growth):.1%} {how} than drawn: was --square-mm {board.square_mm:g} measured on the "
-        f"print? With {board.square_mm / (1 + growth):.3g} they lie as drawn",
+        f"the cameras lie {abs(growth):.1%} {direction} than drawn: was --square-mm {board.square_mm:g} measured on "
+        f"the print? With {board.square_mm / (1 + growth):.3g} they lie as drawn",
     )
 
 

@@ -29,8 +29,8 @@ def cause_of_absence(images: Sequence[Gray], board: Target) -> str | None:
     """What makes the board be found in most of some images in which it is not as it stands, and what to change; None
     where nothing does."""
     if isinstance(board, BoardSet):
-        told = [(number, _verify_board(images, each)) for number, each in enumerate(board.boards, 1)]
-        alone = next((f"board {number}: {cause}" for number, cause in told if cause is not None), None)
+        causes = [(number, _verify_board(images, each)) for number, each in enumerate(board.boards, 1)]
+        alone = next((f"board {number}: {cause}" for number, cause in causes if cause is not None), None)
         return _other_ids(images, board) or alone
     return _verify_board(images, board) or _other_ids(images, board) or _other_markers(images, board)
 
@@ -166,15 +166,15 @@ def _dictionary(family: str) -> cv2.aruco.Dictionary:
 
 def _other_ids(images: Sequence[Gray], target: Target) -> str | None:
     """Where images show markers with ids that are none of a board's, or of several: which, and which it has."""
-    told = []
+    advice = []
     for family, board in {board.family: board for board in target.boards if board.has_markers}.items():
         own = {each for one in target.boards if one.family == family for each in one.ids}
         strange = [each for each in _ids_seen(images, board) if each not in own]
         if len(strange) >= _FEWEST_MARKERS:
             has = " and ".join(one.ids_told for one in target.boards if one.family == family)
             what = "these boards have" if len(target.boards) > 1 else "this board has"
-            told.append(f"markers of the family {family} with the ids {strange[0]}-{strange[-1]} found, {what} {has}")
-    return "; ".join(told) or None
+            advice.append(f"markers of the family {family} with the ids {strange[0]}-{strange[-1]} found, {what} {has}")
+    return "; ".join(advice) or None
 
 
 def _other_markers(images: Sequence[Gray], board: Board) -> str | None:

@@ -152,11 +152,11 @@ def _join_two_groups(groups: _Groups, seen: Sequence[_Seen]) -> _Groups | None:
         return _join_by_motion(groups, poses)
     _, kind, one, other = max(shared, key=lambda each: each[0])
     side = 0 if kind == "cameras" else 1
-    said = _estimate_hand_eye(poses, one, other, side)
+    candidates = _estimate_hand_eye(poses, one, other, side)
     away = [pose.translation for each in poses.values() for pose in each.values()]
-    best, agreeing = consensus_motion([[each] for each in said], float(np.median(np.linalg.norm(away, axis=1))))
-    if 2 * agreeing < len(said):
-        raise ReconstructionError(_disagreement(groups, kind, one, other, agreeing, len(said)))
+    best, agreeing = consensus_motion([[each] for each in candidates], float(np.median(np.linalg.norm(away, axis=1))))
+    if 2 * agreeing < len(candidates):
+        raise ReconstructionError(_disagreement(groups, kind, one, other, agreeing, len(candidates)))
     return groups.merge_cameras(one, other, best) if side == 0 else groups.merge_boards(one, other, best)
 
 
@@ -165,13 +165,15 @@ def _estimate_hand_eye(
 ) -> list[Rigid3]:
     """``one_from_other`` of two groups of cameras (``side`` 0) or of boards (1), as each instant says at which both
     saw, or were seen by, the same group."""
-    said = []
+    candidates = []
     for key, first in poses.items():
         second = poses.get((other, key[1]) if side == 0 else (key[0], other), {})
         if key[side] == one:
             both = sorted(set(first) & set(second))
-            said += [first[i] @ second[i].inverse() if side == 0 else first[i].inverse() @ second[i] for i in both]
-    return said
+            candidates += [
+                first[i] @ second[i].inverse() if side == 0 else first[i].inverse() @ second[i] for i in both
+            ]
+    return candidates
 
 
 def _disagreement(groups: _Groups, kind: str, one: int, other: int, agreeing: int, count: int) -> str:

@@ -62,19 +62,19 @@ class LensChoice:
     @property
     def summary(self) -> str:
         """In words, with the figures."""
-        told = ", ".join(f"{model} {px:.3f}" for model, px in self.held_out_px.items())
-        return f"{self.model}" + (f" (px in views held out: {told})" if told else "")
+        errors = ", ".join(f"{model} {px:.3f}" for model, px in self.held_out_px.items())
+        return f"{self.model}" + (f" (px in views held out: {errors})" if errors else "")
 
 
 def choose_lens(
-    views: Sequence[BoardView], board: Target, size: tuple[int, int], asked: LensName = "auto"
+    views: Sequence[BoardView], board: Target, size: tuple[int, int], requested: LensName = "auto"
 ) -> tuple[LensChoice, Adjusted]:
     """The model that is asked for or that the views call for, and the camera by it, calibrated alone.
 
     Raises ReconstructionError where no camera fits the views.
     """
-    if asked != "auto":
-        model = _SPLINED if asked == "splined" else asked
+    if requested != "auto":
+        model = _SPLINED if requested == "splined" else requested
         alone = calibrate_model(model, views, board, size)
         sound = _sound(views, alone)
         if len(sound) < len(views):

@@ -395,12 +395,12 @@ def _keep_unobservable_falloff(sensor: Sensor, given: Sensor) -> Sensor:
 
 
 def _numbers(sensor: Sensor, noise: Noise) -> dict[str, float | None]:
-    covariance, told = require_covariance(sensor.covariance), _corner_sigma(sensor) <= _NO_CORNER
+    covariance, falloff_known = require_covariance(sensor.covariance), _corner_sigma(sensor) <= _NO_CORNER
     return {
         "gain": sensor.gain,
         "gain_sigma_pct": 100 * float(np.sqrt(covariance[0, 0])),
-        "corner_loss_pct": 100 * sensor.corner_loss if told else None,
-        "corner_loss_sigma_pct": 100 * _corner_sigma(sensor) if told else None,
+        "corner_loss_pct": 100 * sensor.corner_loss if falloff_known else None,
+        "corner_loss_sigma_pct": 100 * _corner_sigma(sensor) if falloff_known else None,
         "gamma": sensor.gamma,
         "gamma_sigma_pct": 100 * float(np.sqrt(covariance[3, 3])),
         "noise_dn": noise.noise_dn,
@@ -450,8 +450,8 @@ def _difference_in_sigmas(halves: Sequence[tuple[Samples, Shading]], cameras: in
     (_, one), (_, other) = halves
     difference = (one.unknowns - other.unknowns)[:size]
     variance = np.diag(one.covariance + other.covariance)[:size]
-    told = variance > 0
-    return float(np.sqrt(np.mean(difference[told] ** 2 / variance[told])))
+    determined = variance > 0
+    return float(np.sqrt(np.mean(difference[determined] ** 2 / variance[determined])))
 
 
 def _rms(residuals: Float[np.ndarray, "n"]) -> float:

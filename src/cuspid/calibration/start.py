@@ -222,9 +222,9 @@ def _average_relative_pose(poses: Poses, known: str, new: str, instants: Sequenc
 
     Raises ReconstructionError where less than half of them do.
     """
-    said = [[pose @ poses[known, instant][0].inverse() for pose in poses[new, instant]] for instant in instants]
+    candidates = [[pose @ poses[known, instant][0].inverse() for pose in poses[new, instant]] for instant in instants]
     distance_mm = float(np.median([np.linalg.norm(poses[new, instant][0].translation) for instant in instants]))
-    best, agreeing = consensus_motion(said, distance_mm)
+    best, agreeing = consensus_motion(candidates, distance_mm)
     if 2 * agreeing < len(instants):
         raise ReconstructionError(
             f"calibration: only {agreeing} of {len(instants)} instants agree on the pose of {new} relative to "

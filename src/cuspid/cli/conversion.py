@@ -59,8 +59,8 @@ def convert(
     _tell(target, carried.losses, carried.notes, max_px)
     write_calibration(target, carried.rig, kind, working_distance_mm)
     names = list(read.rig.names)
-    said = f"{target}: {kind}, {len(names)} camera(s) ({join_names(names)}), from {read.format}"
-    console.print(said, soft_wrap=True, highlight=False)
+    summary = f"{target}: {kind}, {len(names)} camera(s) ({join_names(names)}), from {read.format}"
+    console.print(summary, soft_wrap=True, highlight=False)
 
 
 def _tell(path: Path, losses: Mapping[str, Loss], notes: tuple[str, ...], max_px: float) -> None:

@@ -132,9 +132,9 @@ def _sources(
     return {name: camera for name, (_, camera) in found.items()}
 
 
-def _parse_camera(said: str) -> tuple[str, str]:
+def _parse_camera(text: str) -> tuple[str, str]:
     """Name and source of a camera."""
-    name, is_named, source = said.rpartition("=")
+    name, is_named, source = text.rpartition("=")
     source = f"/dev/video{source}" if source.isascii() and source.isdigit() else source
     return checked_name("record: --cameras", name if is_named else Path(source).stem), source
 

@@ -149,26 +149,26 @@ def plan_import(
 # --- times -----------------------------------------------------------------------------------------------------------
 
 
-def _times_of(film: Film, count: int, said: Mapping[str, float]) -> Float[np.ndarray, "_"]:
+def _times_of(film: Film, count: int, table: Mapping[str, float]) -> Float[np.ndarray, "_"]:
     """The time of each frame, from a table that names frames by image or by number, of the film or of a longer one."""
     numbers = {film.name(k): k for k in range(count)}
-    if not set(said) <= set(numbers):
-        numbers = _index_by_number(film, count, said)
+    if not set(table) <= set(numbers):
+        numbers = _index_by_number(film, count, table)
     found = np.full(count, np.nan)
-    found[[numbers[frame] for frame in said]] = list(said.values())
+    found[[numbers[frame] for frame in table]] = list(table.values())
     return found
 
 
-def _index_by_number(film: Film, count: int, said: Mapping[str, float]) -> dict[str, int]:
-    if all(frame.isascii() and frame.isdigit() for frame in said):
-        ordered = sorted(said, key=int)
+def _index_by_number(film: Film, count: int, table: Mapping[str, float]) -> dict[str, int]:
+    if all(frame.isascii() and frame.isdigit() for frame in table):
+        ordered = sorted(table, key=int)
         if int(ordered[-1]) < count:
             return {frame: int(frame) for frame in ordered}
         if len(ordered) == count:
             return {frame: k for k, frame in enumerate(ordered)}
     raise InputError(
-        f"the table of times lists {len(said)} frames of {film.camera}, {min(said)} to {max(said)}, but {film.source} "
-        f"has {count} frames, numbered differently; give the table that belongs to the films"
+        f"the table of times lists {len(table)} frames of {film.camera}, {min(table)} to {max(table)}, but "
+        f"{film.source} has {count} frames, numbered differently; give the table that belongs to the films"
     )
 
 

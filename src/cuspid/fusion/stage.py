@@ -108,7 +108,7 @@ def fuse(
 def _explain_empty_surface(funnel: Funnel | None, faces: int) -> str:
     """Why nothing is left, and what to change."""
     if funnel is None or not funnel.kept:
-        told = "the depth maps are empty" if funnel is None else f"the depth maps are empty ({funnel.summary})"
+        finding = "the depth maps are empty" if funnel is None else f"the depth maps are empty ({funnel.summary})"
         advice = {
             "begun": "the images overlap too little, are out of focus, or their depth lies outside the depth range of "
             "the calibration",
@@ -117,7 +117,7 @@ def _explain_empty_surface(funnel: Funnel | None, faces: int) -> str:
             "agreed": "views contradict each other: check the calibration and the poses",
             "kept": "what agrees is scattered: the images need more texture or sharper focus",
         }
-        return f"{told}; {advice[funnel.narrowest] if funnel else 'the images need texture or sharper focus'}"
+        return f"{finding}; {advice[funnel.narrowest] if funnel else 'the images need texture or sharper focus'}"
     if not faces:
         return f"no {FusionOptions.min_maps} depth maps confirm the same surface ({funnel.summary}); check the poses"
     return f"cleaning removed all of {faces:,} faces; lower --cleaning.min-piece-width ({funnel.summary})"

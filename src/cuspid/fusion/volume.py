@@ -138,14 +138,14 @@ def neighbour_keys(keys: Int[np.ndarray, "b"]) -> Int[np.ndarray, "b 27"]:
     return pack(unpack(keys)[:, None] + (np.array(list(np.ndindex(3, 3, 3))) - 1))
 
 
-def find(keys: Int[np.ndarray, "b"], wanted: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+def find(keys: Int[np.ndarray, "b"], queries: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
     """Where each of the wanted keys stands among others, -1 where it does not."""
     if len(keys) == 0:
-        return np.full(wanted.shape, -1)
+        return np.full(queries.shape, -1)
     order = np.argsort(keys)
     ranked = keys[order]
-    place = np.searchsorted(ranked, wanted).clip(0, len(keys) - 1)
-    return np.where(ranked[place] == wanted, order[place], -1)
+    place = np.searchsorted(ranked, queries).clip(0, len(keys) - 1)
+    return np.where(ranked[place] == queries, order[place], -1)
 
 
 def _grow_array(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v"]:

@@ -67,7 +67,7 @@ def rank_sources(
     rig: Rig, distance_mm: float, options: PairingOptions = PairingOptions()
 ) -> Mapping[str, tuple[str, ...]]:
     """For each camera the others that it is matched with, best first, for a surface at the given distance."""
-    names, worth = rig.names, np.zeros((len(rig.names),) * 2)
+    names, weights = rig.names, np.zeros((len(rig.names),) * 2)
     for one, other in combinations(range(len(names)), 2):
         pair = names[one], names[other]
         if rig.angle_deg(*pair) > options.max_angle_deg + _ROUNDING_DEG:
@@ -75,8 +75,8 @@ def rank_sources(
         shared = _view_overlap(rig, pair, distance_mm)
         if shared >= options.min_overlap:
             angles = np.array([rig.meeting_deg(*pair, distance_mm), rig.meeting_deg(*pair[::-1], distance_mm)])
-            worth[one, other], worth[other, one] = shared * angle_weight(angles)
-    return {name: tuple(names[k] for k in _best(row, options)) for name, row in zip(names, worth, strict=True)}
+            weights[one, other], weights[other, one] = shared * angle_weight(angles)
+    return {name: tuple(names[k] for k in _best(row, options)) for name, row in zip(names, weights, strict=True)}
 
 
 def rank_by_points(
@@ -93,7 +93,7 @@ def rank_by_points(
     sees[sightings[:, 0], sightings[:, 1]] = True
     ranked = []
     for reference in range(len(centres)):
-        worth = np.zeros(len(centres))
+        weights = np.zeros(len(centres))
         mine = np.flatnonzero(sees[reference])
         towards = unit(centres[reference] - points[mine])
         for other in np.flatnonzero(sees[:, mine].sum(axis=1) >= _LEAST_SHARED) if len(mine) else ():
@@ -102,17 +102,17 @@ def rank_by_points(
             angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
             # The median angle, since most points of a view are seen again at its best side only.
             enough = min(1.0, np.sqrt(both.sum() / min(_SHARED_ENOUGH, len(mine))))
-            worth[other] = enough * angle_weight(np.array(np.median(angle_deg)))
-        worth[reference] = 0
-        ranked.append(_best(worth, options))
+            weights[other] = enough * angle_weight(np.array(np.median(angle_deg)))
+        weights[reference] = 0
+        ranked.append(_best(weights, options))
     return tuple(ranked)
 
 
-def _best(worth: Float[np.ndarray, "v"], options: PairingOptions) -> tuple[int, ...]:
+def _best(weights: Float[np.ndarray, "v"], options: PairingOptions) -> tuple[int, ...]:
     """Indices of the views that are worth enough, best first."""
-    order = np.argsort(-worth, kind="stable")[: options.max_sources]
-    least = max(options.min_share * worth.max(initial=0.0), _LEAST_WORTH)
-    return tuple(int(k) for k in order if worth[k] >= least)
+    order = np.argsort(-weights, kind="stable")[: options.max_sources]
+    least = max(options.min_share * weights.max(initial=0.0), _LEAST_WORTH)
+    return tuple(int(k) for k in order if weights[k] >= least)
 
 
 def stereo_pairs(

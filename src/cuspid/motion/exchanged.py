@@ -240,9 +240,9 @@ def _fits(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> B
 
 def _contradicted_cameras(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c"]:
     """Cameras of which hardly a match with those beside them agrees, while those of others do."""
-    told = counts >= _TOLD
-    lost = told.any(axis=1) & ~(told & (agreeing >= _LOST_SHARE * counts)).any(axis=1)
-    return np.asarray(lost & (told & (agreeing >= _SHARE * counts)).any())
+    sufficient = counts >= _TOLD
+    lost = sufficient.any(axis=1) & ~(sufficient & (agreeing >= _LOST_SHARE * counts)).any(axis=1)
+    return np.asarray(lost & (sufficient & (agreeing >= _SHARE * counts)).any())
 
 
 @dataclass(frozen=True, eq=False)

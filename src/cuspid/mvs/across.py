@@ -157,8 +157,8 @@ def _sightings(images: Sequence[tuple[str, str]], found: Reconstruction) -> list
     frames, cameras = list(found.frames), list(found.rig.names)
     number = tracks.frame_index * len(cameras) + tracks.camera_index
     order = np.argsort(number, kind="stable")
-    wanted = np.array([frames.index(frame) * len(cameras) + cameras.index(camera) for frame, camera in images])
-    start, end = (np.searchsorted(number[order], wanted, side) for side in ("left", "right"))
+    image_numbers = np.array([frames.index(frame) * len(cameras) + cameras.index(camera) for frame, camera in images])
+    start, end = (np.searchsorted(number[order], image_numbers, side) for side in ("left", "right"))
     return [np.unique(tracks.point_index[order[a:b]]) for a, b in zip(start, end, strict=True)]
 
 

@@ -117,7 +117,7 @@ def stitch(
     if isinstance(frames, Capture):
         return (stitch_rig(frames, options, progress=progress),)
     if options.method == "thesis":
-        method = load_plugin("cuspid.stitching", "thesis", asked="--method thesis", distribution="cuspid-thesis")
+        method = load_plugin("cuspid.stitching", "thesis", requested="--method thesis", distribution="cuspid-thesis")
         panoramas = method(frames, examination=options.examination, progress=progress)
         return require_content(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(frames, options.motion, progress=progress)
@@ -260,13 +260,13 @@ def _facing_down(found: Reconstruction) -> str:
 def _uses(capture: Capture, found: Reconstruction, camera: str) -> tuple[FrameUse, ...]:
     """What became of the frames in the picture of a camera."""
     reasons = {each.what.removeprefix("frame "): each.reason for each in found.dropped}
-    told = {
+    observations = {
         frame.name: None
         if camera in frame.cameras and frame.name in found.rig_from_world
         else reasons.get(frame.name, f"no image of camera {camera}")
         for frame in capture.frames
     }
-    return tuple(FrameUse(name=name, used=reason is None, reason=reason) for name, reason in told.items())
+    return tuple(FrameUse(name=name, used=reason is None, reason=reason) for name, reason in observations.items())
 
 
 def _scale_notes(found: Reconstruction, camera: str) -> Iterator[str]:

@@ -189,8 +189,8 @@ def _write(folder: Path, located: LocatedPhotographs) -> None:
     if found.tracks is not None:
         comment = "lengths in mm" if found.has_scale else storage.NO_SCALE
         storage.write_points(folder / "points.ply", found.tracks.points, found.tracks.colors, comment)
-    told = {"scale": "unknown"} if scale is None else {"scale": "known", **asdict(scale)}
-    storage.write_json(folder / "scale.json", told)
+    record = {"scale": "unknown"} if scale is None else {"scale": "known", **asdict(scale)}
+    storage.write_json(folder / "scale.json", record)
     storage.write_reconstruction(folder, found, capture.handpiece)
 
 

@@ -175,8 +175,8 @@ def find_poses(
         return take_poses(capture, colmap_model, folder / "motion")
     if resolve_signal(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
-        made_from, how = depths.digest, options.surfaces
-        found = locate_by_surfaces(capture, depths, made_from, folder / "motion", how, progress=progress)
+        made_from, tracking = depths.digest, options.surfaces
+        found = locate_by_surfaces(capture, depths, made_from, folder / "motion", tracking, progress=progress)
         return replace(found, notes=(*_unused_shutters(capture, "shading"), *found.notes))
     doubts = _unused_shutters(capture, "texture")
     if options.own_images:
@@ -210,12 +210,12 @@ def _hold_consistent_calibration(
     offset_px = epipolar_offset_px(capture, options.tracking, cache=folder / "cache", progress=progress)
     if offset_px is not None and offset_px > _FITS_PX:
         return capture, ()
-    told = (
+    finding = (
         "too little is matched to refine it"
         if offset_px is None
         else f"its epipolar lines fit within {offset_px:.1f} px"
     )
-    note = f"calibration: held as in the file, which states no uncertainty: {told}"
+    note = f"calibration: held as in the file, which states no uncertainty: {finding}"
     return replace(capture, handpiece=without_covariances(capture.handpiece)), (note,)
 
 
@@ -432,8 +432,8 @@ def evaluate(
     found = measure_deviation(
         scan, against.jaw, options, scannable=against.scannable, crown=against.crown, sigma_um=sigma_um
     )
-    told = (*(f"scan: {note}" for note in facing), *(() if against is reference else against.notes))
-    return replace(found, notes=(*told, *found.notes))
+    notes = (*(f"scan: {note}" for note in facing), *(() if against is reference else against.notes))
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def reference_of(truth: GroundTruth | Jaw | Mesh) -> Reference:

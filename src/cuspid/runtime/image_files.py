@@ -289,8 +289,8 @@ def _as_levels(path: Path, values: Shaped[np.ndarray, "h w"]) -> UInt16[np.ndarr
 def _bare_png(path: Path) -> bytes:
     """A PNG with its pixels only: of anything else, libpng may complain to the terminal."""
     data = read_bytes(path, "image")
-    wanted = (data[at - 8 : at + length + 4] for kind, _, at, length in _chunks(io.BytesIO(data)) if kind in _PIXELS)
-    return b"".join([_PNG_START, *wanted])
+    chunks = (data[at - 8 : at + length + 4] for kind, _, at, length in _chunks(io.BytesIO(data)) if kind in _PIXELS)
+    return b"".join([_PNG_START, *chunks])
 
 
 _lock = Lock()

@@ -97,7 +97,7 @@ def partners(motion: SparseModel, share: float) -> dict[int, int]:
     poses = [pose.inverse() for pose in motion.cam_from_world.values()]
     centres = np.array([pose.translation for pose in poses])
     axes = np.array([pose.rotation[:, 2] for pose in poses])
-    wanted = share * float(np.median(motion.depths))
+    baseline = share * float(np.median(motion.depths))
     found: dict[int, int] = {}
     for one in range(len(poses) - 1):
         others = np.arange(one + 1, min(one + 1 + _REACH, len(poses)))
@@ -105,7 +105,7 @@ def partners(motion: SparseModel, share: float) -> dict[int, int]:
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         along = np.sum(shift * axis, axis=1)
         sideways = np.linalg.norm(shift - along[:, None] * axis, axis=1)
-        off = np.abs(np.log(np.maximum(sideways, 1e-9) / wanted))
+        off = np.abs(np.log(np.maximum(sideways, 1e-9) / baseline))
         alike = (sideways >= 2 * np.abs(along)) & (axes[others] @ axes[one] > np.cos(np.deg2rad(20)))
         off[~alike] = np.inf
         if off.min() < np.log(1.8):

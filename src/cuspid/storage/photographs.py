@@ -145,16 +145,16 @@ def _group_by_camera(
     sizes: Mapping[Path, tuple[int, int]], masks: Path, calibrated: Camera | None
 ) -> tuple[tuple[Photograph, ...], dict[str, PhotoCamera]]:
     """Photographs, and the cameras that took them: one for each size and focal length."""
-    told = {path: _Exif.of(path) for path in sizes}
-    stored = {path: told[path].sensor_size(size) for path, size in sizes.items()}
-    kinds = {path: (stored[path], *told[path].lens) for path in sizes}
+    exif = {path: _Exif.of(path) for path in sizes}
+    stored = {path: exif[path].sensor_size(size) for path, size in sizes.items()}
+    kinds = {path: (stored[path], *exif[path].lens) for path in sizes}
     order = list(dict.fromkeys(kinds.values()))
     names = [_ONE] if len(order) == 1 else [f"{_ONE}-{n + 1}" for n in range(len(order))]
     first = {kind: next(path for path in sizes if kinds[path] == kind) for kind in order}
     cameras = {
         name: PhotoCamera(
             size=kind[0],
-            focal_px=told[first[kind]].focal_px(kind[0]),
+            focal_px=exif[first[kind]].focal_px(kind[0]),
             calibrated=None if calibrated is None else _require_size(calibrated, kind[0], first[kind]),
         )
         for name, kind in zip(names, order, strict=True)
@@ -165,7 +165,7 @@ def _group_by_camera(
             path=path,
             camera=names[order.index(kinds[path])],
             size=stored[path],
-            orientation=told[path].orientation,
+            orientation=exif[path].orientation,
             mask=_mask(masks, path),
         )
         for path in sizes

@@ -81,8 +81,8 @@ def require_one_unit(scan: MeasuredFile, reference: MeasuredFile) -> None:
         return
     other = reference if wrong is scan else scan
     sound = _SURFACE_MM[0] <= other.width_mm <= _SURFACE_MM[1]
-    told = f"{_describe_unit(wrong)}, {other.path} {other.width_mm:.3g} mm ({other.option} {other.unit})"
-    raise InputError(f"{told}: they cannot be of one size; {_advice(wrong, other.width_mm if sound else _USUAL_MM)}")
+    sizes = f"{_describe_unit(wrong)}, {other.path} {other.width_mm:.3g} mm ({other.option} {other.unit})"
+    raise InputError(f"{sizes}: they cannot be of one size; {_advice(wrong, other.width_mm if sound else _USUAL_MM)}")
 
 
 def _in_another_unit(scan: MeasuredFile, reference: MeasuredFile) -> MeasuredFile | None:

@@ -302,8 +302,8 @@ def _elbow(one: Head, other: Head) -> Float[np.ndarray, "3"]:
     middle = starts.mean(axis=0)
     if np.linalg.norm(np.cross(*normals)) < np.sin(np.deg2rad(10)):
         return middle
-    wanted = np.sum(normals * (starts - middle), axis=1)
-    elbow = middle + np.linalg.lstsq(normals, wanted, rcond=None)[0]
+    offsets = np.sum(normals * (starts - middle), axis=1)
+    elbow = middle + np.linalg.lstsq(normals, offsets, rcond=None)[0]
     far = np.linalg.norm(starts - elbow, axis=1).max() > _FAR_ELBOW * np.linalg.norm(starts[0] - starts[1])
     return middle if far else np.asarray(elbow)
 

@@ -497,12 +497,12 @@ def _inverse(
     """``(by_images + prior)^-1 (scatter + prior) (by_images + prior)^-1``. What images tell is up to 1e15 times what
     the prior does, but of a similarity they tell nothing: there it is set to 0, instead of to what rounding leaves."""
     basis, blind = gauge_basis(state) if prior.any() else (np.eye(len(prior)), 0)
-    told, scattered = (basis.T @ matrix @ basis for matrix in (by_images, scatter))
-    for matrix in (told, scattered):
+    information, scattered = (basis.T @ matrix @ basis for matrix in (by_images, scatter))
+    for matrix in (information, scattered):
         matrix[len(matrix) - blind :] = 0
         matrix[:, len(matrix) - blind :] = 0
     held = basis.T @ prior @ basis
-    factor = cho_factor(told + held, lower=True)
+    factor = cho_factor(information + held, lower=True)
     inverse = cho_solve(factor, cho_solve(factor, scattered + held).T)
     return np.asarray(basis @ inverse @ basis.T)
 

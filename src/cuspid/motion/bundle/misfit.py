@@ -164,13 +164,13 @@ def _curvature(raw: State, observations: Observations, weighting: Weighting) -> 
 
 
 def _numbers(
-    state: State, told: System, observations: Observations, weighting: Weighting, held: Bool[np.ndarray, "c n"]
+    state: State, system: System, observations: Observations, weighting: Weighting, held: Bool[np.ndarray, "c n"]
 ) -> _Numbers:
     """What is free of the calibration is counted in standard deviations of its prior, what is held in what is allowed:
     units that move the images by so much."""
-    poses, free = len(told.gradient) - held.size, ~held.ravel()
+    poses, free = len(system.gradient) - held.size, ~held.ravel()
     counts = np.maximum(np.bincount(observations.camera, minlength=len(held)), 1)
-    per_unit_px = weighting.sigma_px * np.sqrt(told.diagonal[poses:].reshape(held.shape) / counts[:, None])
+    per_unit_px = weighting.sigma_px * np.sqrt(system.diagonal[poses:].reshape(held.shape) / counts[:, None])
     units = np.where(held & (per_unit_px > 0), _ALLOWED_PX / np.maximum(per_unit_px, 1e-300), 0.0)
     turn = block_diag(np.eye(poses), *(basis + np.diag(unit) for basis, unit in zip(state.basis, units, strict=True)))
     prior = np.concatenate([np.zeros(poses), free])
@@ -178,8 +178,8 @@ def _numbers(
         raw_from_numbers=turn,
         held=np.concatenate([np.zeros(poses, dtype=bool), ~free]),
         prior=np.diag(prior),
-        hessian=turn.T @ told.matrix @ turn + np.diag(prior),
-        gradient=turn.T @ told.gradient + prior * np.concatenate([np.zeros(poses), state.whitened.ravel()]),
+        hessian=turn.T @ system.matrix @ turn + np.diag(prior),
+        gradient=turn.T @ system.gradient + prior * np.concatenate([np.zeros(poses), state.whitened.ravel()]),
     )
 
 

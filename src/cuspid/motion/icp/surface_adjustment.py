@@ -89,17 +89,17 @@ def lay_together(
 ) -> tuple[list[Rigid3], float, Expectation | None]:
     """The poses with which some points of each surface lie best on those that it is paired with, their mean scatter,
     mm, and what follows for the surface."""
-    found, laid = list(poses), list[Correspondences | None]()
+    found, matches = list(poses), list[Correspondences | None]()
     for number in range(rounds):
-        laid = map_in_threads(partial(_compare_surfaces, some, surfaces, found, distance_mm), pairs)
-        step = _step(_pairs_in_world(pairs, laid, found), len(found))
+        matches = map_in_threads(partial(_compare_surfaces, some, surfaces, found, distance_mm), pairs)
+        step = _step(_pairs_in_world(pairs, matches, found), len(found))
         found = [pose @ small_motion(motion).inverse() for pose, motion in zip(found, step, strict=True)]
         progress("adjustment", number + 1, rounds)
         if np.abs(step[:, 3:]).max() < _CONVERGED * distance_mm:
             break
     progress("adjustment", rounds, rounds)
-    scatter = float(np.mean([each.sigma for each in laid if each is not None] or [0.0]))
-    return found, scatter, _expected_error(some, _pairs_in_world(pairs, laid, found), found, distance_mm)
+    scatter = float(np.mean([each.sigma for each in matches if each is not None] or [0.0]))
+    return found, scatter, _expected_error(some, _pairs_in_world(pairs, matches, found), found, distance_mm)
 
 
 def _compare_surfaces(
@@ -119,7 +119,7 @@ _Pair = tuple[int, int, Correspondences]
 
 
 def _pairs_in_world(
-    pairs: Sequence[tuple[int, int]], laid: Sequence[Correspondences | None], poses: Sequence[Rigid3]
+    pairs: Sequence[tuple[int, int]], matches: Sequence[Correspondences | None], poses: Sequence[Rigid3]
 ) -> list[_Pair]:
     """The pairs that lie on each other."""
     world_from_rig = [pose.inverse() for pose in poses]
@@ -130,7 +130,7 @@ def _pairs_in_world(
                 points=world_from_rig[other].apply(each.points), normals=world_from_rig[other].rotate(each.normals)
             ),
         )
-        for (one, other), each in zip(pairs, laid, strict=True)
+        for (one, other), each in zip(pairs, matches, strict=True)
         if each is not None
     ]
 
@@ -167,14 +167,14 @@ def _covariance(pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: fl
     """
     matrix, _ = _equations(pairs, len(poses))
 
-    def in_space(one: int, laid: Correspondences) -> Float[np.ndarray, "n 3"]:
-        return np.floor(laid.points / (_IN_SPACE * distance_mm))
+    def in_space(one: int, match: Correspondences) -> Float[np.ndarray, "n 3"]:
+        return np.floor(match.points / (_IN_SPACE * distance_mm))
 
-    def in_view(one: int, laid: Correspondences) -> Float[np.ndarray, "n 3"]:
-        return np.floor(poses[one].apply(laid.points) / (_IN_VIEW * distance_mm))
+    def in_view(one: int, match: Correspondences) -> Float[np.ndarray, "n 3"]:
+        return np.floor(poses[one].apply(match.points) / (_IN_VIEW * distance_mm))
 
-    def in_both(one: int, laid: Correspondences) -> Float[np.ndarray, "n 6"]:
-        return np.concatenate([in_space(one, laid), in_view(one, laid)], axis=1)
+    def in_both(one: int, match: Correspondences) -> Float[np.ndarray, "n 6"]:
+        return np.concatenate([in_space(one, match), in_view(one, match)], axis=1)
 
     scatter = (
         _scatter(pairs, in_space, len(poses), len(matrix))

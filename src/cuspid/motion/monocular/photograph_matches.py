@@ -84,8 +84,10 @@ def _detect(photograph: Photograph, options: FeatureOptions, max_image_px: int, 
     return replace(found, pixels=found.pixels * (size / searched))
 
 
-def _resize(image: Shaped[np.ndarray, "h w *c"], size: Int[np.ndarray, "2"], how: int) -> Shaped[np.ndarray, "a b *c"]:
-    return np.asarray(cv2.resize(image, size.tolist(), interpolation=how))
+def _resize(
+    image: Shaped[np.ndarray, "h w *c"], size: Int[np.ndarray, "2"], interpolation: int
+) -> Shaped[np.ndarray, "a b *c"]:
+    return np.asarray(cv2.resize(image, size.tolist(), interpolation=interpolation))
 
 
 def _equalize_contrast(image: Pixels) -> UInt8[np.ndarray, "h w 3"]:

@@ -151,8 +151,8 @@ def _attempt(
     progress: Progress,
 ) -> _Attempt:
     started = time.perf_counter()
-    how = options.plain_features if plain else options.features
-    features, unread = detect_in_all(order, how, max_image_px=options.max_image_px, even=plain, progress=progress)
+    keypoints = options.plain_features if plain else options.features
+    features, unread = detect_in_all(order, keypoints, max_image_px=options.max_image_px, even=plain, progress=progress)
     detected = time.perf_counter()
     database = folder / f"{'plain' if plain else 'first'}.db"
     pairs = match_all(photographs, order, features, database, options, plain=plain, progress=progress)
@@ -218,8 +218,8 @@ def _models(
     )
     models = attempt(loose=plain)
     found = focal_shares(models)
-    told = all(each.calibrated is not None or each.focal_px is not None for each in photographs.cameras.values())
-    for focal_share in (found,) if found or told else _OTHER_FOCALS:
+    focal_known = all(each.calibrated is not None or each.focal_px is not None for each in photographs.cameras.values())
+    for focal_share in (found,) if found or focal_known else _OTHER_FOCALS:
         if models and len(located_images(models[0])) == count:
             break
         guess_focal_lengths(database, photographs, focal_share)
@@ -282,9 +282,11 @@ def _notes(photographs: Photographs, model: PhotoModel, found: _Attempt) -> list
     for name, camera in model.cameras.items():
         known = photographs.cameras[name]
         if known.calibrated is None:
-            told = "EXIF and the photographs" if known.focal_px is not None else "the photographs"
+            sources = "EXIF and the photographs" if known.focal_px is not None else "the photographs"
             lens = ", ".join(f"{value:.4f}" for value in camera.distortion)
-            notes.append(f"{name}: focal length {camera.focal_px[0]:.0f} px and distortion ({lens}) found from {told}")
+            notes.append(
+                f"{name}: focal length {camera.focal_px[0]:.0f} px and distortion ({lens}) found from {sources}"
+            )
     angle = float(np.median(_widest_angles_deg(model)))
     if angle < _NARROW_DEG:
         notes.append(

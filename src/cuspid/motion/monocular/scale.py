@@ -298,11 +298,11 @@ def scale_by_distances(model: PhotoModel, distances: Sequence[PickedDistance]) -
     left = factor * lengths - measured
     rms_mm = float(np.sqrt(np.mean(left**2)))
     sigma_mm = max(_READING_MM, rms_mm)
-    told = " and ".join(f"{each:g} mm" for each in measured)
+    given = " and ".join(f"{each:g} mm" for each in measured)
     return Scale(
         mm_per_unit=factor,
         sigma_share=sigma_mm / float(np.linalg.norm(measured)),
-        told_by=f"{told} between picked places",
+        told_by=f"{given} between picked places",
         residual_mm=rms_mm,
     )
 

@@ -466,8 +466,10 @@ def _long_tracks(tracks: Tracks, reach: int) -> Tracks:
 def count_observations(frames: Sequence[FrameUse], part: SparseModel) -> tuple[FrameUse, ...]:
     """Frames, each with the number of observations that hold it in a part."""
     counts = np.bincount(part.tracks.frame_index, minlength=len(part.frames)).tolist()
-    held = dict(zip(part.frames, counts, strict=True))
-    return tuple(replace(frame, inliers=held[frame.name]) if frame.name in held else frame for frame in frames)
+    observations = dict(zip(part.frames, counts, strict=True))
+    return tuple(
+        replace(frame, inliers=observations[frame.name]) if frame.name in observations else frame for frame in frames
+    )
 
 
 def weak_stretches(frames: Sequence[FrameUse]) -> tuple[tuple[FrameUse, ...], ...]:
@@ -494,10 +496,10 @@ def weak_stretch_notes(frames: Sequence[FrameUse]) -> tuple[str, ...]:
     if not stretches:
         return ()
     usual = np.median([frame.inliers for frame in frames if frame.used and frame.inliers is not None])
-    told = [_describe_stretch(stretch) for stretch in stretches[:_MOST_TOLD]]
-    more = f", and at {len(stretches) - len(told)} other places" if len(stretches) > len(told) else ""
+    described = [_describe_stretch(stretch) for stretch in stretches[:_MOST_TOLD]]
+    more = f", and at {len(stretches) - len(described)} other places" if len(stretches) > len(described) else ""
     return (
-        f"the path is held loosely at {', '.join(told)}{more}, where {usual:.0f} are usual: it may bend there "
+        f"the path is held loosely at {', '.join(described)}{more}, where {usual:.0f} are usual: it may bend there "
         "(camera_path.png); film there again, more slowly",
     )
 

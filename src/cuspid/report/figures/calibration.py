@@ -122,16 +122,16 @@ def _draw_ruler(figure: Figure, board: Board, top_mm: float) -> None:
 
 
 def _describe_board(board: Board) -> str:
-    told = f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm"
+    text = f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm"
     if board.kind == "charuco":
-        told += f", {board.dictionary}, markers {board.marker_share:g}"
+        text += f", {board.dictionary}, markers {board.marker_share:g}"
     if board.kind == "aprilgrid":
-        told += f", {board.family}, spacing {board.spacing_share:g}"
+        text += f", {board.family}, spacing {board.spacing_share:g}"
     if board.has_circles:
-        told += f", circles of {board.circle_mm:g} mm"
+        text += f", circles of {board.circle_mm:g} mm"
     if board.has_markers:
-        told += f", ids {board.ids_told}"
-    return told + (f"\n{board.terraces} terraces, steps of {board.step_mm:g} mm" if board.terraces > 1 else "")
+        text += f", ids {board.ids_told}"
+    return text + (f"\n{board.terraces} terraces, steps of {board.step_mm:g} mm" if board.terraces > 1 else "")
 
 
 def save_residuals_picture(

@@ -86,9 +86,9 @@ def crown_faces(jaw: Jaw, curve: ArchCurve) -> Bool[np.ndarray, "f"]:
 
 def crown_points(jaw: Jaw, curve: ArchCurve, reach_mm: float) -> CrownPoints:
     """Points on the crowns, and in which directions something stands within ``reach_mm`` of them."""
-    wanted = crown_faces(jaw, curve)
-    crowns = jaw.mesh.submesh(wanted)
-    labels = np.full(len(wanted), GUM) if jaw.face_labels is None else jaw.face_labels
+    selected = crown_faces(jaw, curve)
+    crowns = jaw.mesh.submesh(selected)
+    labels = np.full(len(selected), GUM) if jaw.face_labels is None else jaw.face_labels
     count = max(int(crowns.face_areas.sum() / _AREA_MM2), 1)
     points, faces = crowns.sample(count, np.random.default_rng(0))
     is_open = openness(jaw.mesh, points, crowns.face_normals[faces], OPENNESS_REACH_MM) >= LEAST_OPENNESS
@@ -100,7 +100,7 @@ def crown_points(jaw: Jaw, curve: ArchCurve, reach_mm: float) -> CrownPoints:
     return CrownPoints(
         points=points,
         normals=normals,
-        teeth=labels[wanted][faces],
+        teeth=labels[selected][faces],
         open=open_,
         directions=directions,
         nearest=_nearest_table(directions),

@@ -39,9 +39,9 @@ def read_config(files: Mapping[str, Document], hints: Hints) -> Calibration:
     """The cameras of a rig. Raises InputError."""
     (document,) = files.values()
     rig = rig_from_config(document.value, hints.image_size_px)
-    told = hints.image_size_px or all("camera_size" in each for each in document.value[0]["cameras"])
+    has_size = hints.image_size_px or all("camera_size" in each for each in document.value[0]["cameras"])
     guessed = "the file has no image sizes; twice the principal point is assumed (--image-size W H)"
-    return Calibration(cameras=rig.cameras, notes=() if told else (guessed,))
+    return Calibration(cameras=rig.cameras, notes=() if has_size else (guessed,))
 
 
 def write_config(cameras: Mapping[str, MountedCamera], suffix: str) -> str:

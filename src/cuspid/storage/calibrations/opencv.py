@@ -101,8 +101,8 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     return Calibration(cameras=cameras, losses=losses, notes=tuple(notes))
 
 
-def _name(found: Mapping[str, Any], usual: str) -> str:
-    return checked_name("camera_name", found.get("name", usual))
+def _name(found: Mapping[str, Any], default: str) -> str:
+    return checked_name("camera_name", found.get("name", default))
 
 
 def _merge_files(files: Mapping[str, Document]) -> Mapping[str, Any]:

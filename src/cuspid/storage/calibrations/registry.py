@@ -129,8 +129,8 @@ def read_calibration(
     with reading(path):
         name = kind or _recognise(files)
         found = FORMATS[name].read(files, Hints(image_size_px=image_size_px))
-        told, note = _unit(FORMATS[name], found, unit)
-        rig = Rig({each: scale_lengths(mounted, MM_PER_UNIT[told]) for each, mounted in found.cameras.items()})
+        unit_found, note = _unit(FORMATS[name], found, unit)
+        rig = Rig({each: scale_lengths(mounted, MM_PER_UNIT[unit_found]) for each, mounted in found.cameras.items()})
     return ReadCalibration(rig=rig, format=name, losses=found.losses, notes=found.notes + note)
 
 
@@ -157,9 +157,9 @@ def _recognise(files: Mapping[str, Document]) -> Name:
 
 def _unit(format: Format, found: Calibration, given: Unit | None) -> tuple[Unit, tuple[str, ...]]:
     """The unit of lengths, and what is to be said of it."""
-    told = format.unit if format.tells_unit else found.unit
-    if given is not None or told is not None:
-        return given or told or "mm", ()
+    known_unit = format.unit if format.tells_unit else found.unit
+    if given is not None or known_unit is not None:
+        return given or known_unit or "mm", ()
     centres = [each.centre_in_rig for each in found.cameras.values()]
     apart = max((float(np.linalg.norm(one - other)) for one, other in combinations(centres, 2)), default=0.0)
     usual = format.unit or "mm"

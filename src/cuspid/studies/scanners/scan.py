@@ -91,13 +91,13 @@ class Measured:
     """Signed distance of each sample of the scan from the reference."""
     sample_place: Int[np.ndarray, "s"]
     """The place next to it, or `BEYOND`."""
-    told: Mapping[str, Any]
+    record: Mapping[str, Any]
     """All else, as JSON knows it."""
 
 
 def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> Measured:
     """Read and measure one scan. Raises InputError where it has no part in the study, and says why."""
-    mesh, told = _read(scan, specimen)
+    mesh, record = _read(scan, specimen)
     rough = _register(mesh, specimen, options)
     samples, _ = mesh.sample(options.samples, np.random.default_rng([options.seed, 1]))
     pose, parts, missed = _align(scan, mesh, samples, specimen, rough.reference_from_scan, options)
@@ -112,12 +112,12 @@ def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> M
         place_um=place_um.astype(np.float32),
         sample_um=sample_um.astype(np.float32),
         sample_place=sample_place.astype(np.int32),
-        told={
-            **told,
+        record={
+            **record,
             "reference_from_scan": pose.matrix,
             "overlap": rough.overlap,
             "similarity_scale_ppm": 1e6 * (rough.scale - 1),
-            "notes": [*told["notes"], *rough.notes, *missed],
+            "notes": [*record["notes"], *rough.notes, *missed],
             "deformation": None if deformation is None else asdict(deformation),
             "spans": [asdict(span) for kind, found in _kinds(stations).items() for span in spans(kind, found)],
             "shifts": [_shift(kind, label, station) for (kind, label), station in stations.items()],
@@ -131,7 +131,7 @@ def write_measured(folder: Path, key: str, measured: Measured, *, made_from: str
     arrays = {name: getattr(measured, name) for name in ("place_um", "sample_um", "sample_place")}
     write_arrays(folder / f"{key}.npz", arrays)
     storage.write_json(
-        folder / f"{key}.json", {"made_from": made_from, "sha256": sha256, "failure": None, **measured.told}
+        folder / f"{key}.json", {"made_from": made_from, "sha256": sha256, "failure": None, **measured.record}
     )
 
 

@@ -178,13 +178,13 @@ def load_specimen(
     area = _area_of(path, jaw, occlusal_from_file, read_in, align_teeth)
     places = scatter(mesh, PLACES, np.random.default_rng(0))
     crowns = crowns_of(jaw)
-    curve, told = _curve_of(jaw)
+    curve, note = _curve_of(jaw)
     labels = np.zeros(len(mesh.faces), dtype=np.int64) if jaw.face_labels is None else np.asarray(jaw.face_labels)
     labelled = bool(np.unique(labels[labels != GUM]).size > 1)
     crown = crowns.faces[places.faces]
     at = _length_along(curve, places.points)
     body, bodies, missed = _bodies_of(path, mesh, occlusal_from_file, mm)
-    notes = (*notes, *told, *missed) if odd is None else (odd, *notes, *told, *missed)
+    notes = (*notes, *note, *missed) if odd is None else (odd, *notes, *note, *missed)
     return Specimen(
         name=name,
         mesh=mesh,
@@ -417,23 +417,23 @@ def write_specimen(folder: Path, specimen: Specimen) -> None:
 def read_specimen(folder: Path) -> Specimen:
     """What :func:`write_specimen` wrote. Raises InputError where it is damaged."""
     arrays = read_arrays(folder / "specimen.npz", remedy=_REMEDY)
-    told: dict[str, Any] = storage.read_json(folder / "specimen.json")
+    record: dict[str, Any] = storage.read_json(folder / "specimen.json")
     with storage.reading(folder / "specimen.json"):
         body = Mesh(arrays["body_vertices"], arrays["body_faces"]) if len(arrays["body_faces"]) else None
         return Specimen(
-            name=told["name"],
+            name=record["name"],
             mesh=Mesh(arrays["vertices"], arrays["faces"]),
-            occlusal_from_file=Rigid3.from_matrix(np.array(told["occlusal_from_file"])),
+            occlusal_from_file=Rigid3.from_matrix(np.array(record["occlusal_from_file"])),
             places=Places(points=arrays["place_points"], normals=arrays["place_normals"], faces=arrays["place_faces"]),
             **{name: arrays[name] for name in _ARRAYS},
             spheres={
                 label: Sphere(centre=np.array(each["centre"]), radius_mm=each["radius_mm"])
-                for label, each in told["spheres"].items()
+                for label, each in record["spheres"].items()
             },
-            bodies={label: Rigid3.from_matrix(np.array(matrix)) for label, matrix in told["bodies"].items()},
+            bodies={label: Rigid3.from_matrix(np.array(matrix)) for label, matrix in record["bodies"].items()},
             body=body,
-            landmarks={label: np.array(position) for label, position in told["landmarks"].items()},
-            labelled=told["labelled"],
-            arch=told["arch"],
-            notes=tuple(told["notes"]),
+            landmarks={label: np.array(position) for label, position in record["landmarks"].items()},
+            labelled=record["labelled"],
+            arch=record["arch"],
+            notes=tuple(record["notes"]),
         )

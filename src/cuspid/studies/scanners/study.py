@@ -66,7 +66,7 @@ class Prepared:
     files: StudyFiles
     scans: tuple[ScanFile, ...]
     remarks: tuple[Remark, ...]
-    told: Mapping[str, Mapping[str, Any]]
+    records: Mapping[str, Mapping[str, Any]]
     """What is kept of each of these scans, by its key."""
 
 
@@ -94,24 +94,24 @@ def prepare(
     )
     files = without_repeats(readable, digests)
     made, lost = _specimens(files, out, options, intake, progress)
-    wanted = [scan for scan in files.scans if scan.specimen in made]
-    if not wanted:
+    chosen = [scan for scan in files.scans if scan.specimen in made]
+    if not chosen:
         raise InputError(f"{given}: no specimen can be used: {'; '.join(map(str, lost[:3]))}")
-    keys = {scan.key: _provenance_of(scan, digests, made, options) for scan in wanted}
-    _measure(wanted, keys, out, options, workers, cluster, retry_failed, progress)
-    told = {scan.key: storage.read_json(_record(out, scan.key)) for scan in wanted}
+    keys = {scan.key: _provenance_of(scan, digests, made, options) for scan in chosen}
+    _measure(chosen, keys, out, options, workers, cluster, retry_failed, progress)
+    records = {scan.key: storage.read_json(_record(out, scan.key)) for scan in chosen}
     failed = [
-        Remark(what=scan.name, why=f"{told[scan.key]['failure']}; left out", left_out=True)
-        for scan in wanted
-        if told[scan.key]["failure"] is not None
+        Remark(what=scan.name, why=f"{records[scan.key]['failure']}; left out", left_out=True)
+        for scan in chosen
+        if records[scan.key]["failure"] is not None
     ]
-    good = tuple(scan for scan in wanted if told[scan.key]["failure"] is None)
-    odd = [Remark(what=scan.name, why=note) for scan in good for note in told[scan.key]["notes"]]
+    good = tuple(scan for scan in chosen if records[scan.key]["failure"] is None)
+    odd = [Remark(what=scan.name, why=note) for scan in good for note in records[scan.key]["notes"]]
     return Prepared(
         files=files,
         scans=good,
         remarks=(*files.remarks, *lost, *failed, *odd),
-        told={scan.key: told[scan.key] for scan in good},
+        records={scan.key: records[scan.key] for scan in good},
     )
 
 
@@ -242,16 +242,16 @@ def _is_done(out: Path, key: str, made_from: str, retry_failed: bool) -> bool:
     if not path.exists():
         return False
     try:
-        told = storage.read_json(path)
+        record = storage.read_json(path)
     except InputError:  # damaged: it is made again
         return False
-    if told.get("made_from") != made_from or (told["failure"] is not None and retry_failed):
+    if record.get("made_from") != made_from or (record["failure"] is not None and retry_failed):
         return False
-    return told["failure"] is not None or (out / "scans" / f"{key}.npz").exists()
+    return record["failure"] is not None or (out / "scans" / f"{key}.npz").exists()
 
 
 def _measure(
-    wanted: Sequence[ScanFile],
+    scans: Sequence[ScanFile],
     keys: Mapping[str, tuple[str, str]],
     out: Path,
     options: StudyOptions,
@@ -260,7 +260,7 @@ def _measure(
     retry_failed: bool,
     progress: Progress,
 ) -> None:
-    left = [scan for scan in wanted if not _is_done(out, scan.key, keys[scan.key][1], retry_failed)]
+    left = [scan for scan in scans if not _is_done(out, scan.key, keys[scan.key][1], retry_failed)]
     listed = {
         scan.key: {
             **vars(scan),
