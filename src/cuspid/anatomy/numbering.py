@@ -16,7 +16,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from cuspid.model.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch
 from cuspid.model.mesh import Mesh
@@ -194,12 +194,12 @@ class _Teeth:
         if not 4 <= len(self.values) <= 8 or not set(self.values) <= set(range(1, 9)):
             return False
         right = mesh.face_centres[:, 0] < 0
-        areas = [(mesh.face_areas[faces & right].sum(), mesh.face_areas[faces].sum()) for faces in self._masks(labels)]
+        areas = [
+            (mesh.face_areas[faces & right].sum(), mesh.face_areas[faces].sum())
+            for faces in (labels == value for value in self.values)
+        ]
         both = [_BOTH_SIDES * whole < part < (1 - _BOTH_SIDES) * whole for part, whole in areas]
         return float(np.mean(both)) > 0.7
-
-    def _masks(self, labels: Int[np.ndarray, "f"]) -> Iterator[Bool[np.ndarray, "f"]]:
-        return (labels == value for value in self.values)
 
     def misfit_mm(self, positions: Positions, arch: Arch) -> float:
         """Mean distance along the arch of the teeth from where a numbering says that they stand; infinite if it does

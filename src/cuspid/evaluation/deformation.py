@@ -124,7 +124,7 @@ def fit_deformation(places: Places, curve: ArchCurve, scan: SignedDistance) -> D
     }
     return Deformation(
         amplitudes=dict(zip(MODES, map(float, amplitudes), strict=True)),
-        rms_um={name: _rms(each) for name, each in alone.items()},
+        rms_um={name: float(np.sqrt(np.mean(each**2))) for name, each in alone.items()},
         before_um=before,
         remainder_um=left,
     )
@@ -160,10 +160,6 @@ def _rigid_fields(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6 3"
 def _residual(columns: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """What the columns cannot explain of values."""
     return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
-
-
-def _rms(values: Float[np.ndarray, "n"]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _integral(

@@ -98,7 +98,7 @@ def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
     cameras = {f"o{5 + k}": _outer_camera(options, side) for k, side in enumerate((+1, -1))}
     six = replace(four, rig=Rig({**four.rig.cameras, **cameras}), name="six-cameras")
     if options.lights == "white":
-        lights = {**four.lights, **_outer_lights(options)}
+        lights = {**four.lights, **{f"o{5 + k}": _outer_light(options, side) for k, side in enumerate((+1, -1))}}
         six = replace(six, lights=lights, lightings=_single_lighting(lights))
     return with_holder(six, options.holder)
 
@@ -155,10 +155,6 @@ def _outer_camera(options: DesignOptions, side: int) -> MountedCamera:
     centre = np.array([0, side * _outer_place_mm(options), options.working_distance_mm])
     camera = Camera.from_field_of_view(options.width_px, options.height_px, options.field_of_view_deg)
     return MountedCamera(camera, look_at(centre, axis, np.array([1.0, 0, 0]), 0.0))
-
-
-def _outer_lights(options: DesignOptions) -> dict[str, Light]:
-    return {f"o{5 + k}": _outer_light(options, side) for k, side in enumerate((+1, -1))}
 
 
 def _outer_light(options: DesignOptions, side: int) -> Light:

@@ -269,10 +269,6 @@ def _sweep(
     return np.asarray(planes[0] + label * options.sweep_step_px)
 
 
-def _grid_indices(count: int, spacing: int) -> Int[np.ndarray, "n"]:
-    return np.arange(spacing // 2, count, spacing)
-
-
 @kernel
 @no_type_check
 def _upsample_planes(coarse, spacing, rows, columns, fine):
@@ -548,7 +544,7 @@ class _Refinement:
         geometry = self._geometry = view.geometry
         self._spacing_px, self._bend_px = spacing_px, options.bend_px
         self._view = _View(images, images, reference, geometry.infinite, geometry.parallax, geometry.others)
-        self._rows, self._columns = (_grid_indices(count, spacing_px) for count in view.size)
+        self._rows, self._columns = (np.arange(spacing_px // 2, count, spacing_px) for count in view.size)
         self._colours = colours[np.ix_(self._rows, self._columns)]
         lowest, highest = (view.geometry.scale / depth for depth in reversed(depth_range_mm))
         self._fit = _fit(options, lowest, highest)

@@ -65,7 +65,7 @@ def rescale_panorama(panorama: Panorama, distances: Sequence[MeasuredDistance]) 
         height_mm=height,
         notes=(
             *_notes(panorama, factor, measured, fitted),
-            *(note for note in panorama.notes if not _is_scale_note(note)),
+            *(note for note in panorama.notes if not note.startswith("the scale ")),
         ),
     )
     return Rescaled(panorama=new, factor=factor, lengths_mm=fitted)
@@ -121,8 +121,3 @@ def _notes(
     )
     flat = () if panorama.height_mm is not None else ("the panorama has no heights: distances count as level",)
     return (scale, *apart, *flat)
-
-
-def _is_scale_note(note: str) -> bool:
-    """Whether a note tells what the scale was from."""
-    return note.startswith("the scale ")

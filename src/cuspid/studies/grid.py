@@ -162,11 +162,7 @@ def _attempt(work: Work, case: Case) -> Outcome:
     except CuspidError as error:
         return Outcome(case=case, figures={}, failure=str(error))
     except Exception as error:  # one broken case must not end a study of many hours
-        return Outcome(case=case, figures={}, failure=_one_line(error))
-
-
-def _one_line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}".splitlines()[0]
+        return Outcome(case=case, figures={}, failure=f"{type(error).__name__}: {error}".splitlines()[0])
 
 
 # --- Local processes -----------------------------------------------------------------------------------------------

@@ -371,17 +371,12 @@ def photo_model(
     camera_names = {name: photographs[name].camera for name in names}
     cameras = {name: camera for name, camera in cameras.items() if name in camera_names.values()}
     known = PhotoModel(
-        cameras={name: _keep_calibration(photographs, name, camera) for name, camera in cameras.items()},
+        cameras={name: photographs.cameras[name].calibrated or camera for name, camera in cameras.items()},
         camera_of=camera_names,
         cam_from_world=poses,
         tracks=_tracks(model, [by_name[name] for name in names], list(cameras), camera_names, names, features),
     )
     return from_first(known)
-
-
-def _keep_calibration(photographs: Photographs, name: str, camera: Camera) -> Camera:
-    """A given calibration as it was given, with its covariance."""
-    return photographs.cameras[name].calibrated or camera
 
 
 def _tracks(

@@ -210,7 +210,9 @@ def fit_to_format(rig: Rig, kind: Name) -> CarriedOver:
     lenses = {name: convert_lens(mounted.camera, format.lenses) for name, mounted in rig.cameras.items()}
     cameras = {name: replace(mounted, camera=lenses[name][0]) for name, mounted in rig.cameras.items()}
     notes = []
-    if kind != "handpiece" and any(_is_uncertain(each) for each in rig.cameras.values()):
+    if kind != "handpiece" and any(
+        each.covariance is not None or each.camera.covariance is not None for each in rig.cameras.values()
+    ):
         notes.append(f"{format.title} has no place for covariances: they are left out")
     if not format.keeps_names and count > 1:
         notes.append(f"{format.title} numbers cameras: their order is {', '.join(rig.names)}")
@@ -219,10 +221,6 @@ def fit_to_format(rig: Rig, kind: Name) -> CarriedOver:
         losses={name: loss for name, (_, loss) in lenses.items() if loss is not None},
         notes=tuple(notes),
     )
-
-
-def _is_uncertain(mounted: MountedCamera) -> bool:
-    return mounted.covariance is not None or mounted.camera.covariance is not None
 
 
 def write_calibration(path: Path, rig: Rig, kind: Name, working_distance_mm: float | None = None) -> None:

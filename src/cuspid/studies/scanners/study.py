@@ -317,15 +317,11 @@ def measure_share(*, keys: str, out: Path, options: StudyOptions) -> dict[str, V
             write_measured(out / "scans", key, measured, made_from=entry["made_from"], sha256=entry["digest"])
         except CuspidError as error:
             failed += 1
-            _fail(out, key, entry["made_from"], _without_path(str(error), scan.path))
+            _fail(out, key, entry["made_from"], str(error).removeprefix(f"{scan.path}: "))
         except Exception as error:  # one broken scan must not end the others of its share
             failed += 1
             _fail(out, key, entry["made_from"], f"{type(error).__name__}: {error}".splitlines()[0])
     return {"scans": len(keys.split()), "failed": failed}
-
-
-def _without_path(message: str, path: Path) -> str:
-    return message.removeprefix(f"{path}: ")
 
 
 def _fail(out: Path, key: str, made_from: str, reason: str) -> None:
