@@ -1,4 +1,4 @@
-"""Crowns told from gum: by tooth labels, or by shape where a jaw has none, which is an estimate.
+"""Separates crowns from gum: by tooth labels, or by shape where a jaw has none, which is an estimate.
 
 By shape, a random walker (Grady 2006) on the surface finds for each place whether a walk from there ends sooner on
 crown or on gum. It hardly crosses furrows, and where crowns meet the gum a furrow runs. A walk ends
@@ -63,7 +63,7 @@ class Crowns:
     faces: Bool[np.ndarray, "f"]
     """Faces of crowns; the others are gum or base."""
     estimated: bool
-    """Whether they were told from gum by shape."""
+    """Whether they were separated from gum by shape."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "faces", read_only(self.faces))

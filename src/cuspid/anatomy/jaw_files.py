@@ -157,7 +157,7 @@ def load_landmarked_jaw(
     labels, where it has any.
 
     A file ``<name>.landmarks.json`` or ``<name>.mrk.json`` beside the mesh is found by itself. ``lower`` or ``upper``
-    in the name of the mesh tells the arch where nothing else does. Raises InputError for a landmark that the scheme or
+    in the name of the mesh gives the arch where nothing else does. Raises InputError for a landmark that the scheme or
     the jaw does not know, and where there are neither landmarks nor labels.
     """
     beside = (path.with_suffix(suffix) for suffix in (".landmarks.json", MARKUPS_SUFFIX))

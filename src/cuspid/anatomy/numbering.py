@@ -1,4 +1,4 @@
-"""Tooth labels of a file in FDI numbers: which numbering they are in is told from where the labelled teeth stand.
+"""Tooth labels of a file in FDI numbers: which numbering they use is inferred from where the labelled teeth stand.
 
 A numbering says at which position each label stands: -1, -2 ... from the midline backwards on the patient's right, and
 1, 2 ... on the left. How far along the arch from the midline each position lies is known from the widths of teeth. A
@@ -84,8 +84,8 @@ def number_teeth(
 ) -> Numbered:
     """FDI numbers for the labels of a mesh in its occlusal frame.
 
-    ``sure``: whether the frame is that of a whole arch; otherwise numbers alone tell. ``arch``: where something else
-    than the labels tells it. ``numbering`` and ``label_map`` (label to FDI) overrule what the teeth tell. ``source``
+    ``sure``: whether the frame is that of a whole arch; otherwise the numbers alone decide. ``arch``: where it is known
+    from elsewhere than the labels. ``numbering`` and ``label_map`` (label to FDI) overrule the inference. ``source``
     names the file. Raises InputError where the labels are in no numbering that is known, or contradict where the teeth
     stand, or the arch; the message names the numbering that fits.
     """

@@ -1,6 +1,6 @@
 """The occlusal frame, scale and tooth numbers of a jaw that a user brings, from its shape alone.
 
-The outside of a scan tells where the crowns point: an open surface by the mean of its normals, a closed model by its
+The outside of a scan shows where the crowns point: an open surface by the mean of its normals, a closed model by its
 side that is not smooth. Seen from there the tips of the crowns give the occlusal plane, the symmetry of the crowns the
 midline, and their spread across it which end is anterior. Of a quadrant the anterior end is the one with the narrower
 crowns, and half of an arch, laid on them from there, tells where its front lies.

@@ -61,7 +61,7 @@ class SurfaceOptions(Options):
 def named_surfaces(jaw: Jaw, options: SurfaceOptions = SurfaceOptions()) -> dict[str, Bool[np.ndarray, "f"]]:
     """A mask over the faces for each of `SURFACES`; no face is in two of them, each face of a tooth is in one.
 
-    Raises InputError for a jaw with fewer than two labelled teeth, which do not tell how the arch runs.
+    Raises InputError for a jaw with fewer than two labelled teeth, too few to define the course of the arch.
     """
     codes = np.full(len(jaw.mesh.faces), -1)
     for fdi, axes in tooth_axes(jaw).items():

@@ -1,4 +1,4 @@
-"""What the most instants agree on."""
+"""Consensus among the motions that single instants suggest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ that of the board."""
 
 
 def consensus_motion(candidates: Sequence[Sequence[Rigid3]], distance_mm: float) -> tuple[Rigid3, int]:
-    """Of the motions that each instant leaves open, the one that the most instants agree with, and how many do."""
+    """The motion that most instants support, out of the candidates of each instant, and how many support it."""
 
     def support(candidate: Rigid3) -> tuple[int, float]:
         nearest = [min(motion_difference(each, candidate) for each in options) for options in candidates]
@@ -26,6 +26,6 @@ def consensus_motion(candidates: Sequence[Sequence[Rigid3]], distance_mm: float)
 
 
 def motion_difference(one: Rigid3, other: Rigid3) -> tuple[float, float]:
-    """The turn between two motions, degrees, and the distance, mm."""
+    """Rotation (degrees) and distance (mm) between two motions."""
     between = one @ other.inverse()
     return between.angle_deg, float(np.linalg.norm(one.translation - other.translation))

@@ -114,7 +114,7 @@ class Timing:
     def later(
         self, cameras: Float[np.ndarray, "c"], readouts: Float[np.ndarray, "r"], views: Float[np.ndarray, "v"]
     ) -> Timing:
-        """With delays and readouts that are longer by so many frames."""
+        """The timing with delays and readouts increased by so many frames."""
         return replace(
             self,
             by_camera=_longer(self.by_camera, cameras),
@@ -186,7 +186,7 @@ class Adjusted:
 
     @property
     def influence(self) -> Float[np.ndarray, "i k"]:
-        """By how much each instant moves these (:mod:`cuspid.calibration.scatter`)."""
+        """How much each instant moves the parameters (:mod:`cuspid.calibration.scatter`)."""
         return self._uncertainty[1]
 
     @cached_property

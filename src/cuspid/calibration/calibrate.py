@@ -1,5 +1,5 @@
-"""From views of a board to a rig with its uncertainty: initialise, adjust, leave out what does not fit, and test the
-result on views that were not used for it."""
+"""Calibrates a rig, with its uncertainty, from views of a board: initialise, adjust, reject outliers, and test the
+result on views that were held out."""
 
 from __future__ import annotations
 
@@ -80,7 +80,8 @@ class CalibrationOptions(Options):
     exposed, and kept if that explains images that it was not estimated from. global: all rows are exposed at once."""
 
     frames_per_s: Annotated[float | None, Range(0.001, 100_000)] = None
-    """Rate at which the board was filmed, to tell delays and readouts in ms too; default: that which videos state."""
+    """Rate at which the board was filmed, to report delays and readouts in ms, too; default: that which videos
+    state."""
     outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
     """A view is left out if the RMS of its residuals is beyond this, in standard deviations of all residuals or of its
     camera's."""
@@ -109,7 +110,7 @@ class CameraCheck:
     """The same for the pose in the rig."""
     alone_apart: float | None
     """Difference between the parameters and those from its own views alone, in the standard deviations that the latter
-    state; below 1 if these are right; None if there were too few views to tell."""
+    state; below 1 if these are right; None if there were too few views."""
     delay_frames: float | None
     """How many frames after the others it saw the board, in the mean; None if all cameras exposed together."""
     delay_spread_frames: float | None
@@ -135,8 +136,8 @@ class RigCalibration:
     """Bending of the board, or of several one after the other, or the error of its steps; see
     :mod:`cuspid.calibration.bundle`."""
     body_from_board: Mapping[int, Rigid3]
-    """Of several boards, where they are on the body that they are fixed to, by number from 0; others carry its
-    frame."""
+    """Where each of several boards is on the body that carries them, by number from 0; a board that is not listed
+    defines the frame of the body."""
     uneven_mm: tuple[float, float] | None
     """Standard deviations by which its corners lie elsewhere than given, in its plane and out of it; None if that
     explains no more."""
@@ -144,7 +145,7 @@ class RigCalibration:
     """Standard deviation by which a view shows the board elsewhere than the others at that instant do; None for one
     camera."""
     widened: Mapping[str, float]
-    """By what factor the standard deviations of each lens were widened for what they do not explain; 1 if not."""
+    """Factor by which the standard deviations of each lens were widened to cover unexplained differences; 1 if none."""
     cameras: Mapping[str, CameraCheck]
     """Checks by camera."""
     pixels: Mapping[str, Float[np.ndarray, "n 2"]]

@@ -82,7 +82,7 @@ def _find_on_board(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | 
 
 
 def pieces(view: BoardView, board: Target) -> list[BoardView]:
-    """The flat parts of a view, terrace by terrace or board by board, of which each tells something by itself."""
+    """The flat parts of a view, terrace by terrace or board by board, each of which determines a pose by itself."""
     if isinstance(board, BoardSet):
         return split_by_board(view, board)
     terrace = board.terrace_at(board.corners[view.corner, 0])

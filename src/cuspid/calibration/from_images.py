@@ -1,5 +1,5 @@
-"""From the images of a board to a calibrated handpiece: find the board in each, calibrate the rig, and then what the
-cameras make of light."""
+"""Calibrates a handpiece from images of a board: finds the board in each, calibrates the rig, and then its
+photometry."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ def calibrate(
     """Calibrate the cameras of a rig from the images that each, by name, took of a board. Those of one instant share a
     name, or the number in it.
 
-    ``drawn``: the handpiece as it was designed, whose lights, and no others, lit the board.
-    ``working_distance_mm``: from the cameras to the teeth; by default that of the drawn handpiece, or else the median
-    distance of the board. Raises ReconstructionError, which names the cause, where a camera hardly saw the board as it
-    was described, and InputError where nothing tells which images were taken together.
+    ``drawn``: the handpiece as it was designed, whose lights, and no others, lit the board. ``working_distance_mm``:
+    from the cameras to the teeth; by default that of the drawn handpiece, or else the median distance of the board.
+    Raises ReconstructionError, which names the cause, where a camera hardly saw the board as it was described, and
+    InputError where nothing shows which images were taken together.
     """
     images, named_notes = _match_frames(images)
     views = _views(images, board, progress)

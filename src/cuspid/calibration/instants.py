@@ -12,7 +12,8 @@ _DIGITS = re.compile(r"\d+")
 
 
 def common_instants(names: Mapping[str, Sequence[str]]) -> Mapping[str, tuple[str, ...]] | None:
-    """By camera, the instant of each of its images, given their names; None if the names themselves are the instants.
+    """The instant of each image, by camera, from the names of the images; None if the names themselves are the
+    instants.
 
     Raises InputError where no two cameras have an image of the same name, nor of the same number.
     """

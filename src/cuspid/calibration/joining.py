@@ -231,7 +231,7 @@ def _join_by_motion(groups: _Groups, poses: Mapping[tuple[int, int], Mapping[str
 
 
 def second_turn_deg(poses: Sequence[Rigid3]) -> float:
-    """By how much poses are turned about the second of the axes about which they are turned most, RMS."""
+    """RMS rotation of poses about the second of their principal axes of rotation."""
     vectors = np.stack([(pose @ poses[0].inverse()).rotation_vector for pose in poses])
     values = np.linalg.svd(vectors - vectors.mean(axis=0), compute_uv=False)
     return float(np.rad2deg(values[1] / np.sqrt(len(poses))))

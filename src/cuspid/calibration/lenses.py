@@ -53,7 +53,7 @@ class LensChoice:
     """The one that was taken."""
     held_out_px: Mapping[str, float]
     """RMS of the residuals in views that a calibration by a model was not made from; empty where there were too few
-    views to tell."""
+    views."""
     chosen: Camera | None = None
     """The camera by the one that was taken, and"""
     rival: Camera | None = None
@@ -61,7 +61,7 @@ class LensChoice:
 
     @property
     def summary(self) -> str:
-        """In words, with the figures."""
+        """One line with the errors that decided."""
         errors = ", ".join(f"{model} {px:.3f}" for model, px in self.held_out_px.items())
         return f"{self.model}" + (f" (px in views held out: {errors})" if errors else "")
 

@@ -100,7 +100,7 @@ class CameraLight:
     gain_sigma_pct: float
     """Standard deviation of the gain."""
     corner_loss_pct: float | None
-    """Light that is lost in the corners of the image; None where the images do not tell."""
+    """Light that is lost in the corners of the image; None where the images do not determine it."""
     corner_loss_sigma_pct: float | None
     """Standard deviation of the corner loss, in the same unit."""
     gamma: float

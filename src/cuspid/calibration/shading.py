@@ -226,7 +226,7 @@ def adjust_shading(
 ) -> Shading:
     """The unknowns that best explain the brightness of the patches (Gauss-Newton on the Huber loss).
 
-    Values in ``held`` are held fixed (NaN where they are free). How far the light at an instant deviates from that of
+    Values in ``held`` are kept fixed (NaN where they are free). How far the light at an instant deviates from that of
     the lamps is estimated, unless it is given; if no lamps are known, it is unconstrained.
     """
     start = np.zeros(len(given.precision)) if held is None else np.nan_to_num(held)

@@ -183,7 +183,7 @@ def _rms_of(residuals: Sequence[Float[np.ndarray, "n 2"]]) -> float:
 
 
 Poses = Mapping[tuple[str, str], Sequence[Rigid3]]
-"""By camera and instant, ``cam_from_board`` under each numbering of the corners."""
+"""``cam_from_board`` under each numbering of the corners, by camera and instant."""
 
 
 def groups(views: Collection[tuple[str, str]], cameras: Sequence[str]) -> list[list[str]]:

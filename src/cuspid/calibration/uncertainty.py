@@ -46,8 +46,8 @@ def projection_sigma_px(camera: Camera, columns: int = 32) -> Float[np.ndarray, 
 def lens_difference_px(
     camera: Camera, other: Camera, seen: Float[np.ndarray, "n 2"], columns: int = 32
 ) -> Float[np.ndarray, "r c 2"]:
-    """By how much another lens would move the projections of a camera of far points, px, on a grid of square cells over
-    the image; NaN where either has no inverse or shows nothing.
+    """How far another lens would move a camera's projections of distant points, px, on a grid of square cells over the
+    image; NaN where either has no inverse or shows nothing.
 
     The other camera is turned so that it agrees best where corners were seen: a turn is no difference between lenses.
     """

@@ -42,10 +42,10 @@ def convert(
         target: File to write: handpiece.json and other .json, rig_config.json, transforms.json, stereoParams.json,
             camchain.yaml (Kalibr), other .yml, .yaml (OpenCV), camera_array.toml (caliscope), other .toml (anipose),
             .xml (Metashape); or a folder, for two cameras of ROS.
-        from_: What the file is, where its content does not tell.
-        to: What is written, where the name does not tell.
-        unit: Unit of the lengths that are read, where the file does not tell it.
-        image_size: Width and height of the images, px, where the file does not tell them.
+        from_: Format of the file, where its content does not show it.
+        to: Format to write, where the name does not show it.
+        unit: Unit of the lengths that are read, where the file does not state it.
+        image_size: Width and height of the images, px, where the file does not state them.
         working_distance_mm: Distance from the cameras to the surface, for a handpiece.json (guessed unless given).
         max_px: A lens that the other format does not have is replaced by the nearest that it has; more than this
             difference in the image is refused.

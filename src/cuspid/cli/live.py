@@ -34,7 +34,7 @@ class FollowOptions(Options):
     watch: bool = False
     """Follow a folder into which images are still being written, instead of replaying a capture."""
     pace: Annotated[float | None, Range(0.001, 1000)] = None
-    """Frames a second of a replay; default: at the times that the capture tells, without these as fast as possible."""
+    """Frames a second of a replay; default: at the times stored in the capture, without these as fast as possible."""
     late_s: Annotated[float, Range(0, 3600)] = 2.0
     """A watched frame whose images are not all there is taken without them this long after the first image of a later
     one."""

@@ -156,7 +156,7 @@ def _write(folder: Path, part: Stitched) -> None:
 
 
 def save_path_picture(folder: Path, panorama: Panorama, cam_from_world: Mapping[str, Rigid3]) -> None:
-    """camera_path.png, with the frames that are held loosely."""
+    """camera_path.png, with weakly constrained frames marked."""
     loose = {frame.name for stretch in weak_stretches(panorama.frames) for frame in stretch}
     save_camera_path(folder / "camera_path.png", panorama, cam_from_world, loose)
 

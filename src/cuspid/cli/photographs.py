@@ -1,4 +1,4 @@
-"""From photographs of one camera to a mesh: the part of ``cuspid reconstruct`` that has no handpiece."""
+"""Reconstructs a mesh from photographs of one camera: the part of ``cuspid reconstruct`` that has no handpiece."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def reconstruct_photographs(
     scale: PhotoScaleOptions,
     model: Path | None = None,
 ) -> None:
-    """Reconstruct, and tell how it went. ``model``: a COLMAP model, whose poses are taken."""
+    """Reconstruct and print a summary. ``model``: a COLMAP model, whose poses are taken."""
     settings = {"reconstruction": options, "photographs": photographs, "scale": scale, "from_poses": model}
     with show_progress() as progress:
         given = _read_photographs(source, out, handpiece, progress)

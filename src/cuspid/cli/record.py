@@ -73,8 +73,8 @@ def record(
     copies: Annotated[int, Range(1, 50)] = 1,
     coverage: Annotated[CoverageOptions, Flat] = CoverageOptions(),
 ) -> None:
-    """Record several cameras at once, without loss, with their exposure held and a time for each image: footage for
-    cuspid import, or images of a board for cuspid calibrate.
+    """Record several cameras at once, without loss, with fixed exposure and a time for each image: footage for cuspid
+    import, or images of a board for cuspid calibrate.
 
     Args:
         cameras: The cameras, each as NAME=SOURCE or SOURCE: a device (/dev/video0, or its number), or a video or a

@@ -103,7 +103,7 @@ def reconstruct(
     reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
 ) -> None:
     """Reconstruct poses and a mesh: in millimetres from images and a handpiece file, or from photographs of one camera,
-    whose scale a board or a measured distance tells.
+    scaled by a board or a measured distance.
 
     Args:
         capture: Folder with images/<camera>/<frame>.png of a handpiece, folder of photographs, or video of one camera.
@@ -134,7 +134,7 @@ def evaluate(
 
     Args:
         mesh: The scan (STL, PLY, OBJ, OFF), in any pose, in --unit.
-        reference: A mesh, or the folder truth/ of a simulation, which also tells what could be seen.
+        reference: A mesh, or the folder truth/ of a simulation, which also records what could be seen.
         out: Folder for the results.
         reference_unit: Length unit of the reference, if it is another one than that of the scan.
     """
@@ -158,7 +158,7 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
 
 
 def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None = None) -> None:
-    """Reconstruct, and tell how it went. ``model``: a COLMAP model, whose poses are taken."""
+    """Reconstruct and print a summary. ``model``: a COLMAP model, whose poses are taken."""
     settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs):

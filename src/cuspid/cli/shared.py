@@ -139,7 +139,7 @@ def _require_places(path: Path, device: Handpiece) -> None:
 
 
 def suit_lights(probe: Probe, texture: Preset) -> Probe:
-    """With the lights that suit the teeth, for a built-in design for which none are asked for."""
+    """A probe with the lights that suit the teeth, if it is a built-in design without explicit ones."""
     if probe.handpiece is not None or probe.lights is not None:
         return probe
     plain = texture in ("enamel", "natural")
@@ -149,7 +149,7 @@ def suit_lights(probe: Probe, texture: Preset) -> Probe:
 
 
 def print_expected(found: Reconstruction, sigma_um: Float[np.ndarray, "v"]) -> None:
-    """Tell how far a surface may be off; nothing where the poses do not tell it."""
+    """Tell how far a surface may be off; nothing where the poses do not determine it."""
     expected = found.expectation
     if expected is None:
         return

@@ -40,7 +40,8 @@ class References(Options):
     """How the reference meshes are read."""
 
     unit: storage.Unit | None = None
-    """Length unit of the references; told by their size unless given. That of each scan is told by its reference."""
+    """Length unit of the references; inferred from their size unless given. That of each scan is inferred from its
+    reference."""
     arch: Arch | None = None
     """Which jaw they show, if their teeth are to be numbered."""
     labels: Numbering = "auto"
@@ -76,7 +77,7 @@ def study(
     Args:
         folder: The folder, or the CSV table.
         out: Folder for report.html, figures/ (PNG at 300 dpi, PDF), tables/ (CSV) and tables.xlsx, study.json.
-        plan_um: A difference of mean deviations that the next study should see: its sample size is told.
+        plan_um: A difference of mean deviations that the next study should see: its sample size is printed.
         dry_run: List what would be compared and what is odd (duplicates, other units, mirrored or partial scans, other
             jaws), after a first alignment, which the study uses again.
         workers: Processes on this machine, one core each (default: one for each core).

@@ -2,8 +2,8 @@
 
 A panorama that knows which frame each of its pixels came from is evaluated by geometry: the pixel's ray, from where the
 frame truly was, meets the true jaw in a point, and the panorama places that point somewhere in the occlusal plane. The
-best similarity (least squares, Umeyama 1991) of all tooth pixels is removed; what remains is the geometric error.
-It is told once more along the direction in which the panorama looks at the jaw, which may be another than that of the
+best similarity (least squares, Umeyama 1991) of all tooth pixels is removed; what remains is the geometric error. It is
+reported once more along the direction in which the panorama looks at the jaw, which may be another than that of the
 jaw's occlusal frame. The same similarity lays the panorama over the reference render of the true jaw
 (:class:`cuspid.model.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is
 aligned with it by image features, and only the pictures are compared.

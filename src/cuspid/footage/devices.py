@@ -67,7 +67,7 @@ class FormatOptions(Options):
     """Images that the camera has compressed, written as they come, where it has such; or uncompressed ones, written as
     PNG."""
     settle_s: Annotated[float, Range(0.1, 60)] = 1.5
-    """How long each camera runs before its exposure is held."""
+    """How long each camera runs before its exposure is fixed."""
 
 
 def open_device(device: str) -> Device:

@@ -93,7 +93,8 @@ def open_film(camera: str, source: Path) -> Film:
 
 
 def sizes_of(film: Film) -> Iterator[tuple[str, tuple[int, int]]]:
-    """The place of each image and its width and height, as far as the headers tell; for a video, of the first frame."""
+    """The place of each image and its width and height, as far as the headers state them; for a video, of the first
+    frame."""
     for path in film.images:
         try:
             yield str(path), image_size(path)

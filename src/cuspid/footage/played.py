@@ -14,7 +14,7 @@ from cuspid.runtime.inputs import read_bytes
 from cuspid.storage.videos import read_jpegs, video_rate
 
 USUAL_PER_S = 30.0
-"""Rate of a film that does not tell its own."""
+"""Rate of a film that does not state its own."""
 _JPEG = (".jpg", ".jpeg")
 
 Sleep = Callable[[float], None]

@@ -1,5 +1,5 @@
-"""From footage to a capture: look at every frame once (:func:`survey`), plan (:mod:`cuspid.footage.plan`), and make the
-usable images (:func:`develop`).
+"""Turns footage into a capture: look at every frame once (:func:`survey`), plan (:mod:`cuspid.footage.plan`), and make
+the usable images (:func:`develop`).
 
 The measures of each frame are kept, and so is what each image was made from: an interrupted import resumes, and another
 attempt at synchronising does not read the films again.

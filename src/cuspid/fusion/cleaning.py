@@ -64,7 +64,7 @@ class CleaningReport:
     sharpened_vertices: int = 0
     """Vertices that were moved afterwards onto sharp edges (:mod:`cuspid.fusion.sharp_edges`)."""
     scale: Literal["known", "unknown"] = "known"
-    """unknown: nothing tells the scale, and all lengths are in a unit of their own, whatever the names say."""
+    """unknown: all lengths are in an arbitrary unit, whatever the names say."""
     funnel: Mapping[str, float] | None = None
     """What was left of the pixels from step to step, % (:class:`cuspid.model.reconstruction.Funnel`); None where that
     is not known."""

@@ -77,11 +77,11 @@ class FusionOptions(Options):
         return min(0.001 * frames, 0.01) if self.min_weight is None else self.min_weight
 
     def resolve(self, detail_mm: float, footprint_mm: float) -> FusionOptions:
-        """With the grid for a handpiece whose pixels have a footprint that may be less than the detail.
+        """The options with the voxel size for a handpiece, whose footprint may be less than its detail.
 
-        Depths that scatter tell a slope to scatter / distance, averaged over (distance / footprint)**2 pixels: with a
-        spacing like the square root of both the mesh is not rougher than one whose detail is the footprint. They are
-        blended as far from the surface as they scatter.
+        Depths that scatter determine a slope to scatter / distance, averaged over (distance / footprint)**2 pixels:
+        with a spacing like the square root of both the mesh is not rougher than one whose detail is the footprint. They
+        are blended as far from the surface as they scatter.
         """
         if self.voxel_mm is not None or detail_mm <= footprint_mm:
             return self

@@ -48,7 +48,7 @@ class SharpEdgeOptions(Options):
     reach: Annotated[float, Range(1, 1000)] = 16.5
     """The flanks are looked for within this distance (0.2 mm at 12 um)."""
     inner: Annotated[float, Range(0, 1000)] = 5.0
-    """What lies within this distance from an edge may be rounded or cut off, and does not tell where it is (0.06 mm at
+    """What lies within this distance from an edge may be rounded or cut off, and does not show where it is (0.06 mm at
     12 um)."""
     max_outwards: Annotated[float, Range(0.01, 1000)] = 2.0
     """What lies farther below an edge than measuring rounds it (0.024 mm at 12 um) is round."""

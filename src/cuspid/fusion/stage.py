@@ -71,7 +71,7 @@ def fuse(
     normal (um): that of its depth and, if they are ``expected``, of the poses and the calibration.
 
     ``made_from`` is the digest of the depth maps, which may be iterated more than once; ``detail_mm`` is the detail
-    that the handpiece shows. Raises ReconstructionError where no surface is left, and tells what took it.
+    that the handpiece shows. Raises ReconstructionError where no surface is left, with the reason.
     """
     stage = Stage("mesh", folder, [fusion, cleaning, sharp_edges, detail_mm], _CODE)
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]

@@ -71,7 +71,7 @@ class DesignOptions(Options):
 
 
 def stereo_pair(options: DesignOptions = DesignOptions()) -> Handpiece:
-    """Of the essential four those two that lie across the arch, with the same lights."""
+    """The two cameras of the essential four that lie across the arch, with the same lights."""
     four = _four(options)
     pair = replace(four, rig=Rig({name: four.rig[name] for name in ("o1", "o2")}), name="stereo-pair")
     return with_holder(pair, options.holder)

@@ -117,7 +117,7 @@ class Condition:
 
     @property
     def shortfall(self) -> float:
-        """By which part of the limit it is missed, 0 or more."""
+        """Shortfall as a share of the limit; 0 if the condition is met."""
         missing = self.wanted - self.reached if self.at_least else self.reached - self.wanted
         return max(0.0, missing) / max(abs(self.wanted), 1e-6)
 

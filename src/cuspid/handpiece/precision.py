@@ -230,7 +230,7 @@ def precision_map(
 
 
 def best_of_positions(maps: Sequence[PrecisionMap]) -> PrecisionMap:
-    """Of several positions the one that is best for each face, by the trace of the bound."""
+    """The best of several positions for each face, by the trace of the bound."""
     covariances = np.array([each.covariance for each in maps])
     traces = np.nan_to_num(np.trace(covariances, axis1=2, axis2=3), nan=np.inf)
     best, faces = traces.argmin(axis=0), np.arange(traces.shape[1])

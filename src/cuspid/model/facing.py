@@ -1,7 +1,7 @@
 """Which way the faces of a mesh look: files come with faces that look inwards, some of them or all.
 
 Neighbours whose shared edge runs the same way in both look to different sides; each piece is made to look to one side,
-that of most of its area. Which side is outside is told by rays: from the outside of a surface most directions are free,
+that of most of its area. Rays decide which side is outside: from the outside of a surface most directions are free,
 from its inside (of a closed one) none, and under the crowns of an open scan few. A piece is turned only if its front
 sees less than half of the directions, and clearly less than its back: a hollow, seen from inside, is left as it is.
 """

@@ -49,7 +49,7 @@ def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 
 
 def used_vertices(faces: Int[np.ndarray, "f 3"], count: int) -> Int[np.ndarray, "u"]:
-    """Those of ``count`` vertices that the faces use, in ascending order."""
+    """Indices, in ascending order, of the vertices that the faces use, out of ``count``."""
     return np.flatnonzero(np.bincount(faces.ravel(), minlength=count))
 
 

@@ -52,12 +52,12 @@ class PairingOptions(Options):
     max_sources: Annotated[int, Range(1, 100)] = 6
     """Each view is matched with no more than this many others, the best ones."""
     min_share: Annotated[float, SHARE] = 0.15
-    """A view is not matched with those that are worth less than this share (0 to 1) of the best one: 20 degrees apart
-    is best, 33 degrees are worth 0.7 of it, 40 degrees 0.4 and 50 degrees 0.1."""
+    """A view is not matched with those whose weight is less than this share (0 to 1) of the best one's: 20 degrees
+    apart is best, 33 degrees have 0.7 of that weight, 40 degrees 0.4 and 50 degrees 0.1."""
 
 
 def angle_weight(angle_deg: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """What a source is worth (0 to 1) for lines of sight that meet at an angle: a soft choice of 8 to 20 degrees."""
+    """Weight (0 to 1) of a source whose lines of sight meet at an angle: a soft choice of 8 to 20 degrees."""
     least, most = _BEST_DEG
     fall = np.exp(-0.5 * (np.maximum(angle_deg - most, 0) / _FALL_DEG) ** 2)
     return np.asarray(np.minimum(angle_deg / least, 1) * fall)

@@ -1,8 +1,8 @@
 """Whether the images of one instant contradict the calibration: how far matches lie from their epipolar lines.
 
-A single instant tells nothing of how far apart the cameras stand, and little of how they are turned towards each other;
-what it would change there are errors of its matches and of the lens model. So it should only be asked to refine a
-calibration that it contradicts.
+A single instant does not determine how far apart the cameras are, and hardly their convergence; what it would change
+there are errors of its matches and of the lens model. So it should only be asked to refine a calibration that it
+contradicts.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def epipolar_offset_px(
     capture: Capture, options: MotionOptions, *, cache: Path | None = None, progress: Progress = silent
 ) -> float | None:
     """Median distance of the matches of a pair of cameras from their epipolar lines, the largest over the pairs and
-    frames; None where no pair has matches enough to tell."""
+    frames; None where no pair has enough matches."""
     handpiece, frames = capture.handpiece, [frame.name for frame in capture.frames]
     features = detect_all(Pictures(capture, max_bytes=0), options.sought, progress=progress, cache=cache)
     pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)

@@ -5,8 +5,8 @@ two cameras if it lies near their epipolar lines, in front of both, at a depth t
 all do; of images that were exchanged nearly none do, but nearly all agree with the cameras that took them. These are
 sought as the assignment of images to cameras with which most matches agree: a quadratic one, by a beam search.
 
-Groups of cameras that see nothing in common may be exchanged as a whole, and everything agrees within a frame. How the
-handpiece moved to the next frame then tells them apart: all groups moved with it.
+Groups of cameras that see nothing in common may be exchanged as a whole, and everything agrees within a frame. The
+motion of the handpiece to the next frame then distinguishes them: all groups moved with it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From a capture to metric poses and a sparse model, stage by stage."""
+"""Estimates metric poses and a sparse model from a capture, stage by stage."""
 
 from __future__ import annotations
 
@@ -370,7 +370,7 @@ def _locate_indexed(
 
 
 def add_advice(found: Reconstruction, least: int) -> Reconstruction:
-    """With notes where fewer points than ``least`` tie frames together, and what would make the path more certain."""
+    """Adds notes where fewer points than ``least`` link frames, with advice on how to make the path more certain."""
     return replace(found, notes=(*found.notes, *_loose_notes(found, least), *_advice(found)))
 
 

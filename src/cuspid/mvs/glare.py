@@ -6,7 +6,7 @@ what is compared. Crossed polarisers leave a few percent of it, spread over a sp
 rough: some digital numbers, as much as the shade changes over many pixels. Where the spots lie follows from the places
 of the lights and a first depth; how bright they are, from a common model of gloss with the values of a wet surface.
 They are taken off, and what is left of a spot (its strength may be another, and the first depth is wrong where it was
-pulled) tells how far to trust the comparison.
+pulled) decides how far to trust the comparison.
 
 Light that is scattered below a clear surface leaves it the less the more oblique it is (Fresnel): of wet enamel 5 %
 less at 60 degrees, 25 % at 77. That is known well enough to be made up for.
@@ -61,7 +61,7 @@ def estimate_glare(
     lights: Sequence[Light],
     exit_index: float,
 ) -> Glare:
-    """What a first depth tells of each pixel of its grid, with lights in the frame of its camera and the refractive
+    """What a first depth implies for each pixel of its grid, with lights in the frame of its camera and the refractive
     index of the surface."""
     rays = grid.rays(grid.pixel_centres().reshape(-1, 2)).reshape(grid.height, grid.width, 3)
     spots, share = np.zeros((2, *rays.shape), np.float32), np.ones(depth_mm.shape, np.float32)

@@ -299,7 +299,7 @@ class DepthEstimator:
         are zero where an image shows what is not to be measured. ``alone``: no other frame is measured meanwhile, so
         that the views are measured side by side.
 
-        Raises InputError where shading is to be matched and it is not told which of several patterns was on.
+        Raises InputError where shading is to be matched and it is unknown which of several patterns was on.
         """
         if self.signal == "shading" and lighting is None and len(self.handpiece.lightings) > 1:
             known = ", ".join(each.name for each in self.handpiece.lightings)
@@ -551,8 +551,8 @@ def sources_of(views: ViewSet, index: int, measured: Mapping[int, Measured]) -> 
 def consistent_planes(
     one: Measured, others: Sequence[Measured], resolution: Resolution, checks: ConfidenceOptions
 ) -> Float[np.ndarray, "h w 6"] | None:
-    """The planes of a view that others agree with; None where these are most of what it began with, so that it is not
-    worth looking for more."""
+    """The planes of a view that others agree with; None where these are most of what it began with, so that another
+    search would not pay."""
     assert one.begun is not None
     agreed = are_consistent(one, others, resolution, checks)
     return None if agreed.sum() >= MOST_AGREED * one.begun.sum() else planes_of(one, agreed)

@@ -33,9 +33,9 @@ under clinical optics, most images 0.8-0.95), plain enamel 0.12-0.2, in images o
 def choose_signal(capture: Capture, options: StereoOptions) -> Signal:
     """What depth is best measured from.
 
-    Shade tells something only where the lights are known. Where they are, and what is lit shows little detail, a few
-    frames are matched both ways, and the way that gives more depth on which the views agree is taken; where both are
-    there, as with plain teeth beside sprayed gums, that is by shade, for there bold texture is matched as such.
+    Shade is a signal only where the lights are known. Where they are, and what is lit shows little detail, a few frames
+    are matched both ways, and the way that gives more depth on which the views agree is taken; where both are there, as
+    with plain teeth beside sprayed gums, that is by shade, for there bold texture is matched as such.
     """
     if not capture.handpiece.lights or shows_detail(capture):
         return "texture"

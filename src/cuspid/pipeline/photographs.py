@@ -1,6 +1,6 @@
-"""From photographs of one camera to a capture whose frames are located: what the dense stereo takes.
+"""Turns photographs of one camera into a capture with located frames: the input of dense stereo.
 
-A photograph is a frame that one camera took; the rig frame is that of the camera. Where nothing tells the scale, all
+A photograph is a frame that one camera took; the rig frame is that of the camera. Where the scale is unknown, all
 lengths are in a unit of which the median distance of the surface has :data:`UNITS`, whatever the names of fields say,
 and the result says so (``has_scale``).
 """
@@ -104,7 +104,7 @@ def locate(
 def find_scale(
     model: PhotoModel, photographs: Photographs, options: PhotoScaleOptions, *, progress: Progress = silent
 ) -> Scale | None:
-    """What tells how large things are, None where nothing does: a board before distances."""
+    """What sets the scale; None where nothing does: a board before distances."""
     board = options.board
     if board is not None:
         sightings = _sightings(photographs, board, progress)

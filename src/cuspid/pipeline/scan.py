@@ -263,7 +263,7 @@ def resolve_signal(capture: Capture, options: ReconstructionOptions) -> Signal:
 
 
 def resize_for_quality(capture: Capture, options: ReconstructionOptions) -> Capture:
-    """With images of the size that depth is measured from: photographs of many megapixels are reduced."""
+    """The capture with images of the size that depth is measured from: photographs of many megapixels are reduced."""
     if options.quality == "draft":
         capture = capture.halved()
     while options.quality != "fine" and _largest_px(capture) > _MOST_PX[options.quality]:
@@ -351,7 +351,7 @@ def fusion_for(handpiece: Handpiece, options: ReconstructionOptions) -> FusionOp
 
 
 def resolve_options(options: ReconstructionOptions) -> ReconstructionOptions:
-    """With what the quality decides, where nothing else was asked for."""
+    """The options with everything that the quality decides filled in, unless given."""
     if options.left_share is None:
         left = {"draft": _DRAFT_LEFT_SHARE, "standard": _LEFT_SHARE, "fine": 0.0}
         options = replace(options, left_share=left[options.quality])
@@ -421,8 +421,8 @@ def evaluate(
     *,
     sigma_um: Float[np.ndarray, "v"] | None = None,
 ) -> Trueness:
-    """Trueness of a mesh in any pose. Evaluated is the surface that at least two cameras could see, which the ground
-    truth of a simulation tells; of a jaw or a mesh all of it.
+    """Trueness of a mesh in any pose. The evaluation covers the surface that at least two cameras could see, which the
+    ground truth of a simulation states; of a jaw or a mesh all of it.
 
     ``sigma_um``: the standard deviation that the scan predicts for each of its vertices, along its normal. Raises
     InputError where the two do not belong together or nothing is left to compare.
@@ -437,7 +437,7 @@ def evaluate(
 
 
 def reference_of(truth: GroundTruth | Jaw | Mesh) -> Reference:
-    """What a scan is compared with, of what is known of its object: a mesh, in any pose, tells least, the ground truth
+    """What a scan is compared with, of what is known of its object: a mesh, in any pose, says least, the ground truth
     of a simulation most."""
     if isinstance(truth, GroundTruth):
         seen = scannable(truth)

@@ -1,7 +1,7 @@
 """Image files: read by their content, whole, upright, and as 8 bits whatever they store.
 
-Cameras of 10 and 12 bits often store them in 16. How many bits the images of a folder use is told by the largest value
-of all of them: one alone may just be dark.
+Cameras of 10 and 12 bits often store them in 16. The largest value in the images of a folder shows how many bits they
+use: one alone may just be dark.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ _LONGEST_WAIT_S = 120.0
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Decorator: compile a function when it is first called; in each process anew where nothing can be kept on disk
+    """Decorator: compile a function when it is first called; in each process again where nothing can be cached on disk
     (``NUMBA_CACHE_DIR`` names a place). ``options`` are those of ``numba.njit``."""
     if function is None:
         return partial(kernel, **options)

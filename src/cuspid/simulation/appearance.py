@@ -52,8 +52,9 @@ class Material:
     """Whether the texture is sprayed or painted on, as fine as the cameras need it, rather than the surface's own."""
 
     def at_footprint(self, footprint_mm: float) -> Material:
-        """With an applied texture that suits cameras whose pixels have this footprint: the one for 12 um, unless its
-        finest octave has less than 1 px or more than 25 px there; then it is coarser or finer by whole octaves."""
+        """The material with an applied texture that suits cameras whose pixels have this footprint: the one for 12 um,
+        unless its finest octave has less than 1 px or more than 25 px there; then it is coarser or finer by whole
+        octaves."""
         octaves = np.log2(footprint_mm / _SUITED_MM)
         if not self.applied or abs(octaves) < _ALIKE_OCTAVES:
             return self

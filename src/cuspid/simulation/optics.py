@@ -90,7 +90,7 @@ class OpticsOptions(Options):
 
     @property
     def resolved(self) -> Optics:
-        """With the values of the preset where no others are given."""
+        """The optics with the values of the preset where no others are given."""
         preset = vars({"ideal": IDEAL, "clinical": CLINICAL}[self.optics])
         return Optics(
             **{name: value if (own := getattr(self, name)) is None else own for name, value in preset.items()}

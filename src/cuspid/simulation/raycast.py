@@ -588,8 +588,8 @@ def render_capture(
     done.
 
     Embree holds the interpreter lock, so the work is distributed over processes. Forked ones trace rays in the scene
-    that the parent built (a forked child could not build one) and run kernels that the parent compiled; those that
-    begin anew build their own, and are given the ``sink``, which must then be picklable.
+    that the parent built (a forked child could not build one) and run kernels that the parent compiled; new ones build
+    their own, and are given the ``sink``, which must then be picklable.
     """
     tasks = _frame_by_frame(frames, skip, _TOGETHER if scene.scattering else max(len(frames), 1))
     if not tasks:

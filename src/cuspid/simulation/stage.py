@@ -108,7 +108,7 @@ def take_images(
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, from given poses of the handpiece by frame name. The capture has the handpiece ``known``; by
-    default the true one, as exact. ``less``: what takes less time, for those who are told that it takes long."""
+    default the true one, as exact. ``less``: settings that take less time, suggested where it takes long."""
     if options.optics.scattering and not any(APPEARANCES[options.texture].enamel.scattering_mm):
         _LOG.info(f"optics: --scattering changes nothing, for light does not go below the texture {options.texture}")
     handpiece = with_shutters(with_default_lights(handpiece), options.optics)
@@ -195,7 +195,7 @@ _RENDERERS = {"embree": render_capture, "blender": render_with_blender}
 
 
 def look_of(options: RenderOptions) -> dict[str, object]:
-    """Of the options those that the images depend on besides the poses."""
+    """The options, besides the path, that the images depend on."""
     return {each.name: getattr(options, each.name) for each in fields(RenderOptions)}
 
 

@@ -1,8 +1,8 @@
 """The occlusal frame and a coarse surface, from what the motion of one camera gives: poses and sparse points.
 
 Frames: the *model* is the frame of the motion, in its own units; the *world* is the occlusal frame of
-:mod:`cuspid.model.panorama`, with z = 0 at the tips of the cusps. Where nothing tells the scale, lengths of the world
-are such that the camera was `NOMINAL_MM` from the teeth, and are not called millimetres.
+:mod:`cuspid.model.panorama`, with z = 0 at the tips of the cusps. Where the scale is unknown, lengths of the world are
+such that the camera was `NOMINAL_MM` from the teeth, and are not called millimetres.
 """
 
 from __future__ import annotations
@@ -197,8 +197,8 @@ def in_occlusal_frame(model: SparseModel, scale: ScaleOptions | None) -> SparseM
 
 
 def scale_factor(model: SparseModel, scale: ScaleOptions) -> float:
-    """By what a motion in the occlusal frame is to be scaled: to the known width of the arch, else to the working
-    distance, else to `NOMINAL_MM`."""
+    """Factor that scales a motion in the occlusal frame: to the known width of the arch, else to the working distance,
+    else to `NOMINAL_MM`."""
     if scale.width_mm is not None:
         nearer = NOMINAL_MM / float(np.median(model.depths))
         return nearer * scale.width_mm / _width(nearer * model.tracks.points)

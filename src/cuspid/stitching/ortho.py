@@ -108,7 +108,7 @@ def find_surface_again(
     progress: Progress = silent,
 ) -> Shown:
     """What the same frames show whose poses are known better, with the surface near the one that they showed before,
-    and scaled anew to what sets the scale; arguments as for :func:`find_surface`."""
+    and rescaled to what sets the scale; arguments as for :func:`find_surface`."""
     motion = _align_to_model(located, shown.motion, keeps_scale=beside is not None)
     sparse = height_map(motion, options.height_map)
     start = None if shown.dense is None else (shown.dense, _SLACK * _largest_shift(motion, shown.motion))

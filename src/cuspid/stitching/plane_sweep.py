@@ -8,11 +8,11 @@ that goes along with the camera moves over the surface and pulls what is matched
 instant see the same light and shade: there it is the brightness itself that agrees. The height of each cell then
 follows from semi-global optimisation (Hirschmueller 2008) over the volume of places and heights.
 
-Windows on a plane are wrong where the surface is steep, and its slope tells what light it loses on the way to each
+Windows on a plane are wrong where the surface is steep, and its slope determines the light it loses on the way to each
 camera (see :mod:`cuspid.mvs.glare`). Therefore the same is done again, twice, with finer steps, on copies of the
 surface found before that lie a little higher and lower.
 
-The volume grows with the arch; of the frames only some are held.
+The volume grows with the arch; only some of the frames are in memory.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class Grid(NamedTuple):
 
     @staticmethod
     def of(surface: HeightMap) -> Grid:
-        """That of which a height map was pooled."""
+        """The grid that a height map was pooled from."""
         rows, columns = surface.heights.shape
         cell_mm = surface.cell_mm / _POOL
         return Grid(surface.corner - surface.cell_mm / 2, cell_mm, _POOL * columns, _POOL * rows)
@@ -151,7 +151,7 @@ class Grid(NamedTuple):
 
     @property
     def centres(self) -> Float[np.ndarray, "h w 2"]:
-        """Of the cells."""
+        """Centres of the cells."""
         across, down = (self.cell_mm * (np.arange(count) + 0.5) for count in (self.columns, self.rows))
         return self.corner + np.stack(np.meshgrid(across, down), axis=-1)
 
@@ -387,7 +387,7 @@ def plane_sweep(
 ) -> HeightMap | None:
     """The surface on which images agree, in the occlusal frame; None where no two of them are compared.
 
-    ``motion`` tells where the teeth are; ``sparse`` is the smooth surface through its points, which tells how high they
+    ``motion`` shows where the teeth are; ``sparse`` is the smooth surface through its points, which shows how high they
     reach; ``read`` gives an image by its name. ``start``: what was found with poses that were a little different, and
     how far from it the surface may lie, mm; it is looked for there alone, and taken as known where it was.
     """

@@ -1,8 +1,8 @@
 """The scale of a finished panorama, from distances that were measured in the mouth between places that it shows.
 
 One camera does not know how large things are. Two cusps can be found both in the mouth and in the picture, so that the
-distance between them, taken with callipers, tells the scale: of all that is to be had without a second camera the
-truest (docs/panorama-evaluation.md).
+distance between them, taken with callipers, sets the scale: of all that is to be had without a second camera the truest
+(docs/panorama-evaluation.md).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Rescaled:
     panorama: Panorama
     """In millimetres."""
     factor: float
-    """By what its lengths grew (millimetres per pixel where they were pixels)."""
+    """Factor by which its lengths grew (millimetres per pixel where they were pixels)."""
     lengths_mm: Float[np.ndarray, "n"]
     """The measured distances, in the panorama as it is now."""
 

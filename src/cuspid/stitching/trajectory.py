@@ -41,7 +41,7 @@ def frames_before_return(centres: Float[np.ndarray, "f 2"]) -> int:
 
 
 def drop_reversals(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
-    """A shaky path without its steps back: the mean of frames, in blocks that each go on by a millimetre."""
+    """A shaky path without its steps back: its smoothed places, each at least a millimetre from the last."""
     steady = smooth(path, _TREMOR_FRAMES * STEP_MM)
     kept = [steady[0]]
     for place in steady[1:]:
@@ -60,7 +60,7 @@ def resample_evenly(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]
 
 
 def smooth(curve: Float[np.ndarray, "n 2"], sigma_mm: float) -> Float[np.ndarray, "n 2"]:
-    """Without short bends; the ends go on straight instead of shrinking."""
+    """A curve without short bends; its ends are extrapolated straight instead of shrinking."""
     pad = min(len(curve) - 1, int(4 * sigma_mm / STEP_MM))
     if pad < 2:
         return curve

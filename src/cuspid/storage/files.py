@@ -264,7 +264,7 @@ def claim_folder(
 
     ``run.json`` keeps for each stage the version, the settings and the hashes of the inputs. Of files that the settings
     name only the contents count, which are among the inputs. Raises OutputError where the folder holds files that no
-    run of cuspid wrote, or the same stage made from something else; where that may be replaced, since it is made anew
+    run of cuspid wrote, or the same stage made from something else; where that may be replaced, since it is made again
     as a whole, ``run.json`` stays as it is.
     """
     plain = to_plain(settings, path=lambda _: None)

@@ -198,7 +198,7 @@ def write_mesh(
 
 
 NO_SCALE = "scale unknown: lengths are not in mm"
-"""Comment of a PLY file of which nothing tells the scale."""
+"""Comment of a PLY file whose scale is unknown."""
 
 
 def has_scale(path: Path) -> bool:

@@ -25,7 +25,7 @@ from cuspid.storage.code_digest import PACKAGE, Code
 from cuspid.storage.files import digest_of, hash_file, open_to_append
 
 RECORD = "made.jsonl"
-"""Name of the file that tells what a folder's results were made from."""
+"""Name of the file that records what a folder's results were made from."""
 
 _log = logging.getLogger("cuspid")
 

@@ -1,4 +1,4 @@
-"""Length units of mesh files, which no mesh file states: sizes tell them, most of all where two files meet."""
+"""Length units of mesh files, which no mesh file states: sizes reveal them, most of all where two files meet."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def require_size(file: MeasuredFile) -> None:
 
 
 def require_one_unit(scan: MeasuredFile, reference: MeasuredFile) -> None:
-    """Raise InputError where the sizes of two surfaces that are to be compared tell that one of them, or both, is in
-    another unit, naming which and what unit that seems to be."""
+    """Raise InputError where the sizes of two surfaces to be compared show that one or both are in another unit; it
+    names which, and the likely unit."""
     wrong = _in_another_unit(scan, reference)
     if wrong is None:
         return

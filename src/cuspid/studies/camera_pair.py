@@ -170,7 +170,7 @@ def study_camera_pair(
     over what is seen of the bound with constant noise, ``noise_growth`` is the RMS factor by which matching there is
     noisier; ``expected_*_um`` are those of the bound with that noise, over what is matched; ``within_budget_pct`` is
     the share of the whole surface that is matched and expected within the budget. None where nothing is seen or
-    matched; ``in_tissue`` tells that a camera would touch the jaw, and then nothing is seen.
+    matched; ``in_tissue`` says that a camera would touch the jaw, and then nothing is seen.
 
     Raises InputError where the jaw lacks the tooth, or the tooth a surface to face.
     """

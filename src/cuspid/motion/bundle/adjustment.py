@@ -11,7 +11,7 @@ Unknowns and how a step changes them:
 
 Where a row is exposed a time t after the instant of its frame (:mod:`cuspid.model.shutter`), X is seen at
 ``cam_from_rig[c] @ exp(t v) @ rig_from_world[f] @ X``, to first order in t. The motion v in the frame follows from the
-poses before and after it; it is held while the minimum is sought, and both are found in turn.
+poses before and after it; it is fixed while the minimum is sought, and both are found in turn.
 
 Levenberg-Marquardt on the Huber loss of the residuals in units of their standard deviation. The points are eliminated
 (Schur complement); what remains is a dense system of 6 unknowns a frame and 14 to 18 a camera. After each step the

@@ -52,7 +52,7 @@ _OBSERVABLE = 1e-3
 
 
 class ScoreTest(NamedTuple):
-    """How the images pull at the parameters that are held fixed, once the rest has followed."""
+    """Score of the fixed parameters, with all others at their optimum."""
 
     score: Float[np.ndarray, "k"]
     curvature: Float[np.ndarray, "k k"]

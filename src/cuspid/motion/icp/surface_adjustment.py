@@ -63,8 +63,8 @@ def _shared_fraction(one: _Blocks, other: _Blocks) -> float:
 def neighbours(
     surfaces: Sequence[Surface], poses: Sequence[Rigid3], min_overlap: float, distance_mm: float
 ) -> list[tuple[int, int]]:
-    """Pairs of frames that share more than this part of the smaller surface, told by the blocks of space that it fills,
-    in both orders.
+    """Pairs of frames that share more than this part of the smaller surface, estimated from the blocks of space that it
+    fills, in both orders.
 
     Only relative neighbours (G. Toussaint, Pattern Recognition 12, 1980): a pair is left out if both overlap more with
     a third frame. The farther apart two frames are, the less alike are the errors of their surfaces, and what these do

@@ -327,7 +327,7 @@ def track_surfaces(
     progress: Progress = silent,
 ) -> Reconstruction:
     """Metric poses of the frames of a capture, from their depth maps, which come frame by frame in the order of
-    capture. The calibration is held.
+    capture. The calibration is fixed.
 
     Raises ReconstructionError where too few frames can be placed.
     """

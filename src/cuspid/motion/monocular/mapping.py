@@ -28,7 +28,7 @@ from cuspid.runtime.progress import Progress
 from cuspid.storage.handpieces import camera_from_colmap
 
 LEAST_PHOTOGRAPHS = 3
-"""Two tell no more than a direction from each other."""
+"""Two determine no more than their relative direction."""
 _GUESSED_FOCAL = 1.2
 """Of the longer side: COLMAP's guess, an angle of view of 45 degrees."""
 _STILL_PX, _STILL_SHARE = 0.002, 0.6
@@ -91,7 +91,7 @@ def fill_database(
 
 
 def guess_camera(known: PhotoCamera, camera_id: int, focal_share: float | None = None) -> pycolmap.Camera:
-    """The calibrated camera, or one of the focal length that EXIF tells, or is guessed as a share of the longer
+    """The calibrated camera, or one of the focal length that EXIF states, or is guessed as a share of the longer
     side."""
     if known.calibrated is not None:
         camera = colmap_camera(known.calibrated, camera_id)
@@ -110,8 +110,8 @@ def guess_camera(known: PhotoCamera, camera_id: int, focal_share: float | None =
 
 
 def guess_focal_lengths(database: Path, photographs: Photographs, shares: Mapping[int, float]) -> None:
-    """Start from other guesses of the focal lengths that neither a calibration nor EXIF tells, by number of the camera,
-    or by 0 for any, as shares of the longer side."""
+    """Start from other guesses of the focal lengths that neither a calibration nor EXIF states, by number of the
+    camera, or by 0 for any, as shares of the longer side."""
     with pycolmap.Database.open(database) as opened:
         for number, known in enumerate(photographs.cameras.values(), start=1):
             opened.update_camera(guess_camera(known, number, shares.get(number, shares.get(0))))
@@ -211,7 +211,7 @@ def map_photographs(
     loose: bool,
     progress: Progress,
 ) -> list[ColmapModel]:
-    """Models of ``count`` photographs, largest first; calibrated cameras are held. ``loose``: from fewer matches."""
+    """Models of ``count`` photographs, largest first; calibrated cameras stay fixed. ``loose``: from fewer matches."""
     mapper_options = pycolmap.IncrementalPipelineOptions(
         random_seed=seed, num_threads=1, extract_colors=False, min_model_size=LEAST_PHOTOGRAPHS
     )
@@ -297,8 +297,8 @@ def refine_lens(model: ColmapModel, held: Collection[int]) -> tuple[ColmapModel,
     RMS reprojection error, px.
 
     A parameter more must pay: one that the images do not determine turns with the poses. The principal point stays in
-    the middle: it can hardly be told from a turn of the camera, above all in a ring of photographs. ``held``: numbers
-    of the cameras whose lens is known.
+    the middle: it can hardly be distinguished from a rotation of the camera, above all in a ring of photographs.
+    ``held``: numbers of the cameras whose lens is known.
     """
     rms = _adjust_model(model, held)
     by_camera = dict.fromkeys(model.cameras, 0)

@@ -1,4 +1,4 @@
-"""What photographs have in common: keypoints, the pairs that are worth a match, and matches that one motion explains.
+"""What photographs have in common: keypoints, the candidate pairs, and matches that one motion explains.
 
 Photographs come in any order and turned in any way. Descriptors are therefore not upright, and each photograph is
 matched with all others; of many, with those that look like it (Jégou et al., CVPR 2010, as in
@@ -102,8 +102,8 @@ def _equalize_contrast(image: Pixels) -> UInt8[np.ndarray, "h w 3"]:
 def candidate_pairs(
     features: Mapping[int, Features], *, is_film: bool, most_exhaustive: int, alike: int, seed: int
 ) -> list[tuple[int, int]]:
-    """Pairs that are worth a match: all of a few photographs; otherwise each with the ``alike`` most alike, and in a
-    film with the next ones."""
+    """Candidate pairs: all of a few photographs; otherwise each with the ``alike`` most alike, and in a film with the
+    next ones."""
     order = sorted(features)
     if len(order) <= (0 if is_film else most_exhaustive):
         return list(combinations(order, 2))

@@ -1,4 +1,4 @@
-"""Poses of photographs from a COLMAP model that somebody else made; where it has no points, they are found anew.
+"""Poses of photographs from a COLMAP model that somebody else made; where it has no points, they are triangulated.
 
 Photographs are known by the stem of their name, whatever its case, suffix and folder. The model may be of larger or
 smaller photographs of the same shape.

@@ -333,7 +333,7 @@ def _explain_failure(photographs: Photographs, order: Sequence[Photograph], foun
 
 
 def still_message(photographs: Photographs, pairs: Sequence[Pair]) -> str:
-    """What to tell a user whose camera stood still before a background."""
+    """The message for a user whose camera stood still before a background."""
     still = sum(pair.is_still for pair in pairs)
     return (
         f"{photographs.source}: in {still} of {len(pairs)} pairs of photographs nothing moves: it is the background "

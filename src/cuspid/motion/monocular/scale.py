@@ -36,7 +36,7 @@ _LEAST_MM, _READING_MM = 0.01, 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoScaleOptions(BoardPattern):
-    """What tells how large things are that one camera has photographed: a board, or measured distances."""
+    """What sets the scale of the photographs of one camera: a board, or measured distances."""
 
     square_mm: Annotated[float | None, Range(0.001, 10_000)] = None
     """Side of a square of a board that some photographs show, as measured on the print: it sets the scale."""

@@ -473,10 +473,10 @@ def count_observations(frames: Sequence[FrameUse], part: SparseModel) -> tuple[F
 
 
 def weak_stretches(frames: Sequence[FrameUse]) -> tuple[tuple[FrameUse, ...], ...]:
-    """Stretches of the trajectory that are held by less than half of the observations that its frames have in the
-    median, the weakest first; its ends do not count, for nothing hangs on them. None where observations are not known.
+    """Stretches of the trajectory with less than half of the median number of observations per frame, the weakest
+    first; its ends do not count, for nothing hangs on them. None where observations are not known.
 
-    There a path of one way bends two to four times as often as elsewhere; of one there and back it tells little
+    There a path of one way bends two to four times as often as elsewhere; for one there and back it says little
     (docs/panorama-evaluation.md).
     """
     used = [frame for frame in frames if frame.used]
@@ -491,7 +491,7 @@ def weak_stretches(frames: Sequence[FrameUse]) -> tuple[tuple[FrameUse, ...], ..
 
 
 def weak_stretch_notes(frames: Sequence[FrameUse]) -> tuple[str, ...]:
-    """A note where the trajectory is held loosely."""
+    """A note where the trajectory is weakly constrained."""
     stretches = weak_stretches(frames)
     if not stretches:
         return ()

@@ -1,5 +1,5 @@
 """COLMAP's ``rig_config.json``, and its sparse models as text (``cameras.txt`` and ``images.txt``); and cuspid's own
-``handpiece.json``. None of them tells a unit but the last."""
+``handpiece.json``. Only the last of them states a unit."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def read_config(files: Mapping[str, Document], hints: Hints) -> Calibration:
 
 
 def write_config(cameras: Mapping[str, MountedCamera], suffix: str) -> str:
-    """With ``camera_size``, which COLMAP passes over."""
+    """Writes the configuration with ``camera_size``, which COLMAP ignores."""
     return json.dumps(rig_to_config(Rig(cameras)), indent=2) + "\n"
 
 

@@ -1,6 +1,6 @@
 """Metashape's cameras in XML (Agisoft Metashape Professional, user manual, appendix "Camera models"): the principal
-point is told from the middle of the image, p1 and p2 are OpenCV's p2 and p1, the focal lengths are f + b1 and f, b2 is
-skew, and transforms are ``chunk_from_camera`` with OpenCV's axes."""
+point is relative to the middle of the image, p1 and p2 are OpenCV's p2 and p1, the focal lengths are f + b1 and f, b2
+is skew, and transforms are ``chunk_from_camera`` with OpenCV's axes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The formats by name; which of them a file has is told by its content, which of them it will have by its name."""
+"""The formats by name; that of a file to read follows from its content, that of a file to write from its name."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Format:
 
     title: str
     unit: Unit | None
-    """Of its lengths: where its files do not tell, the usual one."""
+    """Of its lengths: where its files do not state it, the usual one."""
     tells_unit: bool = False
     """Whether that is always the unit."""
     lenses: tuple[Lens, ...]
@@ -124,7 +124,7 @@ def read_calibration(
     image_size_px: tuple[int, int] | None = None,
 ) -> ReadCalibration:
     """Read a file, or the files of a folder where a program writes several. ``unit`` and ``image_size_px`` say what a
-    file does not tell, ``kind`` what it is. Raises InputError."""
+    file leaves out, ``kind`` what it is. Raises InputError."""
     files = _documents(path)
     with reading(path):
         name = kind or _recognise(files)

@@ -1,5 +1,5 @@
 """ROS: ``camera_info``, a YAML file for each camera, as ``camera_calibration_parsers`` and ``camera_calibration`` write
-it, or as a message is printed. Pixel centres are whole numbers, lengths metres. The place of a camera is told only for
+it, or as a message is printed. Pixel centres are whole numbers, lengths metres. The pose of a camera is given only for
 rectified pairs: by the rotation R into the rectified frame, and by P, whose last column holds the baseline."""
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class ScanFile:
 
     @property
     def levels(self) -> dict[str, str | None]:
-        """The cells that tell it in tables."""
+        """The cells that identify it in tables."""
         return {
             "scanner": self.scanner,
             "specimen": self.specimen,
@@ -110,8 +110,8 @@ def find_files(given: Path) -> StudyFiles:
 
 
 def without_repeats(files: StudyFiles, digests: Mapping[str, str]) -> StudyFiles:
-    """Without scans whose file is the same as that of an earlier one, by the digests of their files (key to digest):
-    they would feign precision."""
+    """The files without scans that repeat the file of an earlier one, by digest (of each key): duplicates would feign
+    precision."""
     first: dict[str, ScanFile] = {}
     kept, remarks = [], []
     for scan in files.scans:
@@ -147,7 +147,7 @@ def landmark_file(mesh: Path) -> Path | None:
 
 
 def belongings(reference: Path) -> tuple[Path, ...]:
-    """All files that tell what a specimen is, the reference first."""
+    """All files that describe a specimen, the reference first."""
     others = (area_file(reference), body_file(reference), landmark_file(reference))
     tables = (
         find_beside(reference, [ending]) for ending in (".spheres.csv", ".bodies.csv", "_facelabels.npy", ".json")

@@ -45,7 +45,7 @@ class Estimate:
 
     value: float
     low: float | None
-    """Lower end; None where too few scans tell."""
+    """Lower end; None with too few scans."""
     high: float | None
 
 
@@ -215,7 +215,7 @@ def compare_scanners(
 
 
 def correct_p_values(comparisons: Sequence[Comparison]) -> tuple[Comparison, ...]:
-    """With p corrected for the number of comparisons (Holm)."""
+    """The comparisons with p corrected for their number (Holm)."""
     if not comparisons:
         return ()
     adjusted = holm([each.p for each in comparisons])

@@ -53,8 +53,8 @@ class StudyOptions(Options):
     """How the scans of a study are compared."""
 
     align: AlignmentKind = "best-fit"
-    """By what scans are aligned: a global best fit; a reference area (--align-teeth, or a mesh beside the reference);
-    the crowns; landmarks; spheres; scan bodies; or not at all, for files that are in one frame."""
+    """How scans are aligned: a global best fit; a reference area (--align-teeth, or a mesh beside the reference); the
+    crowns; landmarks; spheres; scan bodies; or not at all, for files that are in one frame."""
     align_teeth: Annotated[tuple[int, ...], TOOTH] = ()
     """FDI numbers of the teeth that are the reference area."""
     region: Region = "all"
@@ -63,7 +63,7 @@ class StudyOptions(Options):
     """How repeats are compared: each pair, at places of the reference; each pair, mesh to mesh (slower); or each with
     their mean surface."""
     max_distance_mm: Annotated[float, Range(0.01, 100)] = 1.0
-    """Surface farther than this from the other one is not shown by it; its share is told."""
+    """Surface farther than this from the other one is not shown by it; its share is reported."""
     samples: Annotated[int, Range(1000, 5_000_000)] = 60_000
     """Samples on each scan, uniform by area."""
     min_overlap: Annotated[float, SHARE] = 0.6

@@ -38,7 +38,7 @@ class Intake:
     """How the references are read."""
 
     unit: storage.Unit | None = None
-    """Their length unit; told by their size unless given. That of each scan is told by its reference."""
+    """Their length unit; inferred from their size unless given. That of each scan is inferred from its reference."""
     arch: Arch | None = None
     """Which jaw they show, if their teeth are to be numbered."""
     labelling: Labelling = field(default_factory=Labelling)

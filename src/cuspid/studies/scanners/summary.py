@@ -1,7 +1,7 @@
 """The scans of a study beside each other: what all of a specimen show, figures of each scan, and precision.
 
 Scans are read one by one from what :mod:`cuspid.studies.scanners.scan` kept of them; of a group of repeats, the
-deviations at the places of the reference are held at once.
+deviations at the places of the reference are in memory at once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cuspid.studies.scanners.soundness import mend_faces
 from cuspid.studies.scanners.specimen import SEGMENTS, Specimen
 
 WITHIN_UM = (10, 25, 50, 100)
-"""Distances within which the share of the surface is told."""
+"""Distances within which the share of the surface is reported."""
 _LEAST_SAMPLES = 50
 """Of a region, for figures."""
 _INTERPROXIMAL = ("mesial", "distal")
@@ -163,7 +163,7 @@ class Compared:
     scan: ScanFile
     measured: Measured
     motion: SmallMotion | None
-    """By what the alignment was corrected; None where it is not one of the whole surface."""
+    """Correction of the alignment; None where it is not one of the whole surface."""
     place_um: Float[np.ndarray, "p"]
     """Deviation at each place; NaN where it is not shown."""
     sample_um: Float[np.ndarray, "s"]
@@ -175,7 +175,7 @@ class Compared:
 
 
 def compare_scan(scan: ScanFile, folder: Path, specimen: Specimen, common: Common, options: StudyOptions) -> Compared:
-    """Read a scan and align it finally: a best fit is made anew, to the places that all scans show, so that gum and
+    """Read a scan and align it finally: a best fit is repeated with the places that all scans show, so that gum and
     borders of one scan do not move it."""
     measured = read_measured(folder, scan.key)
     motion = None
@@ -368,8 +368,8 @@ def _aligned_mesh(each: Compared, specimen: Specimen) -> Mesh:
 def spread_from_mean_um(
     group: Sequence[Compared], common: Common, places: Places, *, align: bool
 ) -> list[float | None]:
-    """Of each scan, the root mean square of its differences from the mean of its group, times sqrt(n / (n - 1)), as
-    the mean contains the scan: what Levene's test compares."""
+    """The root mean square of the differences of each scan from the mean of its group, times sqrt(n / (n - 1)), as the
+    mean contains the scan: what Levene's test compares."""
     count = len(group)
     if count < 2:
         return [None]
