@@ -282,7 +282,7 @@ def test_files_of_boards_are_read(tmp_path: Path, text: str, board: Board) -> No
         (KALIBR.replace("tagSize: 0.088", "tagSize: 88.0"), r"tagSize is 88.0; it must lie between 1e-06 and 10"),
         (KALIBR.replace("tagCols: 6 ", "tagCols: six "), "tagCols is 'six'; it must be a number"),
         ("target_type: aprilgrid\n", "the field 'tagCols' is missing"),
-        ("columns: 5\nsquares: 3\n", "'squares' is no option of a board"),
+        ("columns: 5\nsquares: 3\n", "'squares' is not an option of a board"),
         ("columns: 5\n", "square_mm is missing"),
         ("columns: 5.5\nsquare_mm: 1\n", "columns is 5.5; it must be a whole number"),
         ("legacy: 1\nsquare_mm: 1\n", "legacy is 1; it must be true or false"),

@@ -335,7 +335,7 @@ def test_a_camera_is_held_as_it_says_itself():
     }
     assert [str(each) for each in ready.settings] == [
         "exposure_ms 8 held",
-        "gain 10 refused (it says 4)",
+        "gain 10 refused (it reports 4)",
         "white_balance_k 4600 held",
         "focus not settable",
     ]
@@ -350,7 +350,7 @@ def test_what_the_automatic_chose_is_held():
     assert {each.name: each.told for each in ready.settings if each.is_held} == {
         "exposure_ms": 15.6, "white_balance_k": 4600.0,
     }  # fmt: skip
-    assert str(ready.settings[1]) == "gain 4 (the driver does not let it be set)"
+    assert str(ready.settings[1]) == "gain 4 (the driver does not allow it to be set)"
 
 
 def test_a_camera_whose_automatic_does_not_tell_what_it_chose_is_found_out():

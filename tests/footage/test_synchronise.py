@@ -230,14 +230,14 @@ def test_lights_that_are_not_told_or_cannot_be_are_said(tmp_path, probe, capsys)
     footage = write_folders(tmp_path / "footage", filmed(dict.fromkeys(STARTS, 0), count=6))
     for more, reason in (
         (("--lightings", "a", "c"), "no lighting pattern named 'c'; it has a, b"),
-        (("--lightings", "a", "b", "--sync", "none"), "--lightings: lights that take turns are shared"),
+        (("--lightings", "a", "b", "--sync", "none"), "--lightings: alternating lights require cameras"),
     ):
         line = refused(capsys, "import", footage, "--handpiece", lit(probe), "--out", tmp_path / "capture", *more)
         assert reason in line
         assert not (tmp_path / "capture").exists()
     capture = storage.read_capture(imported(footage, probe))
     assert {frame.lighting for frame in capture.frames} == {None}
-    assert "if they take turns, give --lightings a b" in " ".join(capsys.readouterr().err.split())
+    assert "if the patterns alternate, give --lightings a b" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_part_of_a_long_film_is_chosen_by_time(tmp_path, probe):

@@ -66,7 +66,7 @@ def test_the_guess_for_a_design_is_of_the_right_size(handpiece):
     ],
 )
 def test_where_cameras_tell_no_distance_none_is_guessed(rig):
-    with pytest.raises(InputError, match="working distance cannot be told from the cameras"):
+    with pytest.raises(InputError, match="working distance cannot be inferred from the cameras"):
         guess_working_distance_mm(rig)
 
 

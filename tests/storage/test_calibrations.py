@@ -701,7 +701,7 @@ def test_convert_writes_a_handpiece(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "is the file that is read" in refused(capsys, "rig", "convert", tmp_path / "pair.yml", tmp_path / "pair.yml")
     write(tmp_path, "other.yml", "a: 1\n")
     told = refused(capsys, "rig", "convert", tmp_path / "other.yml", tmp_path / "x.json")
-    assert "cuspid rig convert takes it with --from" in told
+    assert "name it with cuspid rig convert --from" in told
 
 
 _JUNK = st.recursive(

@@ -152,7 +152,7 @@ def test_the_unit_of_a_file_is_told_by_its_reference(tmp_path, jaw, per_mm, unit
     assert found == unit
     assert (odd is None) == (unit == "mm")
     put(tmp_path, "b.stl", Mesh(jaw.mesh.vertices * 25.4, jaw.mesh.faces))
-    with pytest.raises(InputError, match="no size of teeth or jaws"):
+    with pytest.raises(InputError, match="not the size of teeth or jaws"):
         guess_unit(tmp_path / "b.stl", storage.read_mesh(tmp_path / "b.stl"), like_mm=60.0)
 
 

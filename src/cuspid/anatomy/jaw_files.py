@@ -112,7 +112,7 @@ def _load_oriented(
         labels = number_regions(regions, moved, arch)
         if labels is None and needs_teeth:
             raise InputError(
-                f"{path}: its colours tell {regions.max()} teeth, but these are not one row without a gap, so they "
+                f"{path}: its colours separate {regions.max()} teeth, but these are not one row without a gap, so they "
                 f"cannot be numbered; {_GIVE_LABELS}"
             )
     return Jaw(mesh=moved, face_labels=labels, arch=arch), notes, occlusal.occlusal_from_mesh
@@ -129,7 +129,8 @@ def _require_teeth(
         raise InputError(f"{path}: it has neither landmarks nor tooth labels{colors}; {_GIVE_LABELS}")
     if arch is None:
         raise InputError(
-            f"{path}: its colours tell {regions.max()} teeth, but not whether they are lower or upper ones; give --arch"
+            f"{path}: its colours separate {regions.max()} teeth, but do not show whether they are lower or upper; "
+            f"give --arch"
         )
 
 

@@ -508,7 +508,7 @@ def _assumptions(options: MouthOptions) -> tuple[str, ...]:
         f"a handpiece fits at a tooth if thickness, working distance and clearance are at most the {judged} at the "
         "tooth's distal end; the gap grows forwards, so that is the narrowest place along a handpiece that comes in "
         "from the front",
-        f"the mouth is open to {options.held:.0%} of its maximum; nobody holds all of it for long",
+        f"the mouth is open to {options.held:.0%} of its maximum; nobody keeps it fully open for long",
         "healthy adults; teeth count as points of the occlusal planes; cheeks, tongue, lips and the curve of Spee are "
         "left out",
         "all values are normal and independent of each other"

@@ -283,7 +283,7 @@ def _unambiguous_reading(readings: list[_Reading]) -> _Reading | None:
 def _numbered_with_note(labels: Int[np.ndarray, "f"], reading: _Reading) -> Numbered:
     present = set(_values(labels))
     fdi = [each for _, each in sorted(reading.fdi().items()) if each in present]
-    note = f"labels: read as {reading} (FDI {fdi[0]} to {fdi[-1]}), as the teeth stand; --label-map overrules that"
+    note = f"labels: read as {reading} (FDI {fdi[0]} to {fdi[-1]}), as the teeth stand; --label-map overrides this"
     return Numbered(labels=labels, notes=(note,))
 
 

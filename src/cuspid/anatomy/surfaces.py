@@ -79,8 +79,8 @@ def tooth_axes(jaw: Jaw) -> dict[int, Float[np.ndarray, "3 3"]]:
     order = [fdi for fdi in _ARCH_ORDER if fdi in jaw.teeth]
     if len(order) < 2:
         raise InputError(
-            f"surfaces: the jaw has {len(order)} labelled teeth; at least two are needed to tell how the arch "
-            "runs (label each face with its FDI number, gum with 0)"
+            f"surfaces: the jaw has {len(order)} labelled teeth; at least two are needed to find the course of the "
+            f"arch (label each face with its FDI number, gum with 0)"
         )
     tangents = np.gradient([jaw.mesh.centroid(jaw.tooth_faces(fdi))[:2] for fdi in order], axis=0)
     return {fdi: _axes(fdi, along / np.linalg.norm(along)) for fdi, along in zip(order, tangents, strict=True)}

@@ -666,7 +666,7 @@ def _timing_notes(checks: Mapping[str, CameraCheck], frames_per_s: float | None)
     if delays:
         yield (
             "the cameras did not expose together; by the motion of the board, in frames from their mean: "
-            f"{', '.join(delays)}; this is taken into account, but a board that is held still gives more"
+            f"{', '.join(delays)}; this is taken into account, but a board at rest gives more accurate results"
         )
     readouts = [
         describe(name, check.readout, check.readout_sigma, 3)

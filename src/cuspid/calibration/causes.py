@@ -66,7 +66,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
         old, yes = ("new", "--no-legacy") if board.legacy else ("old", "--legacy")
         yield f"the board has the {old} layout of OpenCV: give {yes}", replace(board, legacy=not board.legacy), False
     if board.kind != "circles":
-        yield "the images are mirrored: turn them over (or the print is: print it anew)", board, True
+        yield "the images are mirrored: turn them over (or the print is: print it again)", board, True
     if board.has_markers:
         yield from _other_first_ids(board, images)
     if board.kind == "aprilgrid":

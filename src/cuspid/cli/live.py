@@ -167,15 +167,15 @@ def _follow_feed(feed: _Feed, out: Path, options: ReconstructionOptions, view: G
             if view is not None and session is not None:
                 view.show(session, changed, words.lost)
     except KeyboardInterrupt:
-        console.print("the scan is ended; what came in is reconstructed")
+        console.print("scan ended; reconstructing what came in")
     except CuspidError as error:
         if session is None or not session.rig_from_world:
             raise
-        console.print(f"note: {error}; the scan is ended, and what came in is reconstructed", soft_wrap=True)
+        console.print(f"note: {error}; scan ended; reconstructing what came in", soft_wrap=True)
     left_out = feed.left_out()
     if session is None or not session.frames:
         why = next((f" ({each.what}: {each.reason})" for each in left_out), "")
-        raise InputError(f"no frame has come that can be used{why}; look whether images appear, and in which folder")
+        raise InputError(f"no usable frame has arrived{why}; check whether images appear, and in which folder")
     seconds = time.monotonic() - begin
     console.print(
         f"{len(session.rig_from_world)} of {len(session.frames)} frames placed as they came, "

@@ -69,7 +69,7 @@ def _print(located: LocatedPhotographs, given: Photographs) -> None:
         console.print(f"note: {note}")
     if scale is None:
         console.print(
-            "note: nothing tells the scale: the result has none, and its lengths are not millimetres; give --square-mm "
+            "note: the scale is unknown: the result has none, and its lengths are not millimetres; give --square-mm "
             "for a board in the photographs, or a measured --distance --between two of them"
         )
         return

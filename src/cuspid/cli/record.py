@@ -144,7 +144,7 @@ def _source(name: str, source: str, form: FormatOptions) -> CameraSource:
     if place.is_dir() or place.suffix.lower() in VIDEO_SUFFIXES:
         return FilmCamera(name, place, form.frames_per_s)
     if place.is_file():
-        raise InputError(f"{source}: is no camera, video or folder of images; give a device such as /dev/video0")
+        raise InputError(f"{source}: is not a camera, video or folder of images; give a device such as /dev/video0")
     return V4L2Camera(source, form)
 
 

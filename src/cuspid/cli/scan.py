@@ -117,7 +117,7 @@ def reconstruct(
         reconstruct_photographs(capture, out, handpiece, reconstruction, photographs, scale, from_poses)
         return
     if scale != PhotoScaleOptions():
-        raise InputError("--square-mm and --distance are for photographs of one camera; a handpiece knows the scale")
+        raise InputError("--square-mm and --distance are for photographs of one camera; a handpiece sets the scale")
     reconstruct_capture(storage.read_capture(capture, handpiece, working_distance_mm), out, reconstruction, from_poses)
 
 

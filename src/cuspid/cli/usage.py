@@ -32,7 +32,7 @@ RARE = re.compile(
 _SHORT = """{summary}
 
 {prog} --help-all shows all options.
---config FILE.toml takes them from a file; --write-config FILE.toml writes them as one, and does no more."""
+--config FILE.toml takes them from a file; --write-config FILE.toml writes them to one and exits."""
 _KINDS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH", bool: "{True,False}"}
 
 

@@ -132,7 +132,7 @@ def _note(crown: OpenCrown, could_be_seen: bool, evaluated: list[int]) -> str:
     """What is evaluated, for people."""
     where = "could be seen by two cameras" if could_be_seen else "lies within 200 µm of the scan"
     named = f"{len(evaluated)} pieces" if crown.estimated else ", ".join(map(str, evaluated))
-    estimated = "; crowns were told from gum by their shape, which is an estimate" if crown.estimated else ""
+    estimated = "; crowns were separated from gum by their shape, which is an estimate" if crown.estimated else ""
     return (
         f"evaluated part of the open crown surface: {named}; the share of each that {where} is "
         f"at least three quarters of the best one's{estimated}"

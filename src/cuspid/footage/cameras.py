@@ -91,8 +91,8 @@ class Setting:
         if self.is_held:
             return f"{self.name} {self.told:g} held"
         if self.told == self.asked:
-            return f"{self.name} {self.told:g} (the driver does not let it be set)"
-        return f"{self.name} {self.asked:g} refused (it says {self.told:g})"
+            return f"{self.name} {self.told:g} (the driver does not allow it to be set)"
+        return f"{self.name} {self.asked:g} refused (it reports {self.told:g})"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -214,8 +214,8 @@ class V4L2Camera:
         ratio = max(first, 1.0) / max(second, 1.0)
         if exposure.exposure_ms is None and exposure.gain is None and not 1 / _UNLIKE < ratio < _UNLIKE:
             yield (
-                f"its images are {1 / ratio:.2f} times as bright since the exposure is held: the camera does not tell "
-                "what its automatic had chosen; give --exposure-ms and --gain"
+                f"its images are {1 / ratio:.2f} times as bright since the exposure was fixed: the camera does not "
+                f"report what its automatic had chosen; give --exposure-ms and --gain"
             )
         if not self._is_stamped:
             yield "its driver does not stamp images on this machine's clock; they have the time of their arrival"
@@ -226,10 +226,10 @@ class V4L2Camera:
         now_s = self._clock()
         if not is_read:
             if not Path(self._device).exists():
-                raise InputError(f"{self._device}: it is unplugged; plug it in, and record anew")
+                raise InputError(f"{self._device}: it is unplugged; plug it in, and record again")
             if not self._has_read:
                 raise InputError(f"{self._device}: delivers no images; {_LESS}")
-            raise InputError(f"{self._device}: delivers no more images; look at its plug, and record anew")
+            raise InputError(f"{self._device}: delivers no more images; check its plug, and record again")
         self._has_read = True
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
         self._is_stamped = self._is_stamped and now_s - _MOST_LATE_S < stamp_s <= now_s

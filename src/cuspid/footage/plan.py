@@ -240,7 +240,7 @@ def check_lightings(options: ImportOptions, handpiece: Handpiece) -> None:
     for name in options.lightings:
         handpiece.lights_on(name)
     if options.lightings and options.sync.sync == "none":
-        raise InputError("--lightings: lights that take turns are shared by cameras that expose together; give --sync")
+        raise InputError("--lightings: alternating lights require cameras that expose together; give --sync")
 
 
 def _lightings(
@@ -304,7 +304,7 @@ def _lighting_notes(in_turn: Sequence[str], handpiece: Handpiece) -> Iterator[st
     if len(handpiece.lightings) > 1 and not in_turn:
         names = " ".join(each.name for each in handpiece.lightings)
         yield (
-            "which lighting pattern each frame has is not told, which plain teeth need; if they take turns, give "
+            "the lighting pattern of each frame is unknown, but plain teeth need it; if the patterns alternate, give "
             f"--lightings {names} in their order"
         )
 

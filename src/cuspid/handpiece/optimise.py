@@ -122,7 +122,7 @@ class Condition:
         return max(0.0, missing) / max(abs(self.wanted), 1e-6)
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.reached:.3g}, wanted {'>=' if self.at_least else '<='} {self.wanted:.3g}"
+        return f"{self.name}: {self.reached:.3g}, required {'>=' if self.at_least else '<='} {self.wanted:.3g}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -147,13 +147,15 @@ def guess_working_distance_mm(rig: Rig) -> tuple[float, str]:
     limit_deg = PairingOptions.max_angle_deg
     pairs = [pair for pair in combinations(rig.names, 2) if rig.angle_deg(*pair) <= limit_deg]
     if not pairs:
-        raise InputError("the working distance cannot be told from the cameras: no two of them look the same way")
+        raise InputError("the working distance cannot be inferred from the cameras: no two of them look the same way")
     if min(rig.angle_deg(*pair) for pair in pairs) >= _CONVERGING_DEG:
         distance_mm, source = float(np.median([_axes_meet_mm(rig, *pair) for pair in pairs])), "where their axes meet"
     else:
         distance_mm, source = _least_shared_distance_mm(rig, pairs), "their baselines"
     if not 0 < distance_mm < np.inf:
-        raise InputError("the working distance cannot be told from the cameras: no two of them look at the same place")
+        raise InputError(
+            "the working distance cannot be inferred from the cameras: no two of them look at the same place"
+        )
     return distance_mm, source
 
 

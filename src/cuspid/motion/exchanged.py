@@ -96,8 +96,8 @@ def require_own_images(
     if not found.contradicted:
         return ()
     return (
-        f"motion: hardly a match of the images of {', '.join(found.contradicted)} agrees with the cameras beside, while"
-        " those of others do: look whether it is in its place, and whether its images are its own",
+        f"motion: hardly a match of the images of {', '.join(found.contradicted)} agrees with its neighbours, while "
+        f"those of others do: check whether it is in its place, and whether its images are its own",
     )
 
 

@@ -47,7 +47,7 @@ _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 _ROLLING_SHARE = 0.008
 """Of the height of an image, by which what it shows may move between its rows, before that is known."""
 _HELD = (
-    "calibration: held as in the file, since the images of the one frame share too few points to refine it: its "
+    "calibration: kept as in the file, since the images of the one frame share too few points to refine it: its "
     "cameras stand far apart, or the surface shows little detail"
 )
 

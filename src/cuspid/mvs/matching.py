@@ -304,7 +304,7 @@ class DepthEstimator:
         if self.signal == "shading" and lighting is None and len(self.handpiece.lightings) > 1:
             known = ", ".join(each.name for each in self.handpiece.lightings)
             raise InputError(
-                f"frame {frame}: which lights were on is not told, and plain surfaces are matched by them; give each "
+                f"frame {frame}: which lights were on is unknown, but plain surfaces are matched by them; give each "
                 f"frame's lighting in capture.json ({known}), or import the footage with --lightings"
             )
         names = self.handpiece.rig.names

@@ -108,7 +108,7 @@ class _Views:
     def _measure_view(self, number: int, matched: Mapping[int, _Matched]) -> Measured:
         """What was matched of a view."""
         view = self.located[number]
-        arrays = read_arrays(matched[number].file, remedy="give the command again: it is made anew")
+        arrays = read_arrays(matched[number].file, remedy="run the same command again to recreate it")
         grid = coarser(self._ideal[view.camera].camera, self.options.grid_px)
         depth_mm, sigma_mm = (arrays[name].astype(np.float64) for name in ("depth_mm", "sigma_mm"))
         return Measured(grid, view.mounted.cam_from_rig, depth_mm, sigma_mm, arrays["begun"], arrays["planes"])

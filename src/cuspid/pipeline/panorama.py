@@ -187,7 +187,7 @@ def stitch_rig(capture: Capture, options: StitchOptions = StitchOptions(), *, pr
     if options.method != "ortho":
         raise InputError("stitch: --method thesis takes the images of one camera; give the folder of one camera")
     if options.scale != ScaleOptions():
-        raise InputError("stitch: the cameras of the handpiece tell the scale; leave out --scale")
+        raise InputError("stitch: the cameras of the handpiece set the scale; leave out --scale")
     capture = replace(capture, handpiece=NominalOptions().for_handpiece(capture.handpiece).fill(capture.handpiece))
     found = locate_rig_film(capture, options.rig, options.motion, progress=progress)
     scene = _RigScene(unroll_capture(capture, found), found, options)

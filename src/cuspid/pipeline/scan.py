@@ -196,7 +196,7 @@ def _unused_shutters(capture: Capture, signal: Signal) -> tuple[str, ...]:
     if signal == "shading":
         return (f"{unused}: on plain surfaces depth comes before the motion, which they depend on",)
     if not is_rolling(capture.handpiece.rig, [frame.name for frame in capture.frames]):
-        return (f"{unused}: the frames' names are no numbers in order, and do not tell their times",)
+        return (f"{unused}: the frames' names are not ascending numbers, so their times are unknown",)
     return ()
 
 
@@ -215,7 +215,7 @@ def _hold_consistent_calibration(
         if offset_px is None
         else f"its epipolar lines fit within {offset_px:.1f} px"
     )
-    note = f"calibration: held as in the file, which states no uncertainty: {finding}"
+    note = f"calibration: kept as in the file, which states no uncertainty: {finding}"
     return replace(capture, handpiece=without_covariances(capture.handpiece)), (note,)
 
 

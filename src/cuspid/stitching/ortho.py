@@ -190,7 +190,7 @@ def _tripods(model: SparseModel, length: float) -> Float[np.ndarray, "k 3"]:
     return np.concatenate([pose.inverse().apply(legs) for pose in model.cam_from_world.values()])
 
 
-_TRUER = "measure between two cusps, and cuspid pano rescale makes it truer"
+_TRUER = "measure between two cusps, and correct it with cuspid pano rescale"
 
 
 def _scale_note(scale: ScaleOptions, *, given: bool) -> str:

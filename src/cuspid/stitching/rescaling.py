@@ -114,8 +114,8 @@ def _notes(
     scale = f"the scale is that of {lengths} between places of the picture (before: {before}); {known}"
     off_pct = 100 * (fitted / measured - 1)
     apart = tuple(
-        f"{mm:g} mm come out as {length:.2f} ({off:+.1f} %): look whether the places and the number are right, or how "
-        "the scale drifts along the arch"
+        f"{mm:g} mm come out as {length:.2f} ({off:+.1f} %): check the places and the number, or whether the scale "
+        f"drifts along the arch"
         for mm, length, off in zip(measured, fitted, off_pct, strict=True)
         if abs(off) > _APART_PCT
     )

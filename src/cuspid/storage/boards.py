@@ -50,7 +50,7 @@ def _board_from_options(value: Mapping[str, Any]) -> Board:
     strange = [name for name in given if name not in known]
     if strange or not given:
         raise InputError(
-            f"{', '.join(map(quote, strange)) or 'nothing'} is no option of a board; these are {', '.join(known)}"
+            f"{', '.join(map(quote, strange)) or 'nothing'} is not an option of a board; options are {', '.join(known)}"
         )
     if "square_mm" not in given:
         raise InputError("square_mm is missing: the side of a square in mm")

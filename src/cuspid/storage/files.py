@@ -139,7 +139,8 @@ def _describe(path: Path, error: OSError) -> str:
 def require_suffix(path: Path, *suffixes: str) -> None:
     """Raise OutputError where a file that is to be written has the name of another kind."""
     if path.suffix.lower() not in suffixes:
-        raise OutputError(f"{path}: is no name of what is written; give one that ends in {' or '.join(suffixes)}")
+        choices = " or ".join(suffixes)
+        raise OutputError(f"{path}: has no suffix that can be written; give a name that ends in {choices}")
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -352,8 +352,8 @@ def _rows(folder: Path) -> list[Mapping[str, str]]:
 _STUDY_FIGURES: Mapping[str, str] = {
     "trueness.png": "Trueness and precision: each point is a scan; boxes from the first to the third quartile, "
     "whiskers to the last scan within 1.5 of that range",
-    "modes.png": "Deformation of the arch, a point for each scan: scale, and how far its ends move while the "
-    "middle is held",
+    "modes.png": "Deformation of the arch, a point for each scan: scale, and how far its ends move while the middle "
+    "is fixed",
     "spans.png": "Error against span: each point is a distance of a scan; lines through zero by least squares",
     "agreement.png": "Two scanners on the same distances (Bland and Altman): bias and limits of agreement with their "
     "95 % intervals",

@@ -111,8 +111,8 @@ def _folder_sequence(folder: Path) -> ImageSequence:
     if len(ways) < 2:
         return ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
     note = (
-        f"{folder.name}: EXIF says that the camera was held in {len(ways)} ways; its images are taken as "
-        "the sensor recorded them, none is turned upright"
+        f"{folder.name}: EXIF says that the camera was held in {len(ways)} orientations; its images are used as the "
+        f"sensor recorded them, not turned upright"
     )
     size = _common_size(folder, paths, as_recorded=True)
     return ImageSequence(source=folder, paths=tuple(paths), size=size, notes=(note,), orientations=orientations)

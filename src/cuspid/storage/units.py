@@ -70,7 +70,7 @@ def require_size(file: MeasuredFile) -> None:
     """Raise InputError where a surface is too small or too large to have been scanned, naming the unit that it seems to
     be in."""
     if not _SURFACE_MM[0] <= file.width_mm <= _FARTHEST_MM:
-        raise InputError(f"{_describe_unit(file)}, which is no size of teeth or jaws; {_advice(file, _USUAL_MM)}")
+        raise InputError(f"{_describe_unit(file)}, which is not the size of teeth or jaws; {_advice(file, _USUAL_MM)}")
 
 
 def require_one_unit(scan: MeasuredFile, reference: MeasuredFile) -> None:
@@ -82,7 +82,7 @@ def require_one_unit(scan: MeasuredFile, reference: MeasuredFile) -> None:
     other = reference if wrong is scan else scan
     sound = _SURFACE_MM[0] <= other.width_mm <= _SURFACE_MM[1]
     sizes = f"{_describe_unit(wrong)}, {other.path} {other.width_mm:.3g} mm ({other.option} {other.unit})"
-    raise InputError(f"{sizes}: they cannot be of one size; {_advice(wrong, other.width_mm if sound else _USUAL_MM)}")
+    raise InputError(f"{sizes}: their sizes do not match; {_advice(wrong, other.width_mm if sound else _USUAL_MM)}")
 
 
 def _in_another_unit(scan: MeasuredFile, reference: MeasuredFile) -> MeasuredFile | None:

@@ -28,7 +28,8 @@ class BoardSet:
         for number, board in enumerate(self.boards, 1):
             if not board.has_markers:
                 raise InputError(
-                    f"boards: number {number} is a {board.kind}, which nothing tells from the others; several boards "
+                    f"boards: number {number} is a {board.kind}, which cannot be distinguished from the others; "
+                    f"several boards "
                     "need markers (charuco, aprilgrid)"
                 )
             if board.terraces > 1:

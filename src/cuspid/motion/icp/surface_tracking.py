@@ -136,7 +136,7 @@ def _rejection_reason(step: _Step, overlap: float, options: SurfaceTrackingOptio
     if match.sigma > match.share * options.max_scatter * distance_mm:
         return f"its surface scatters about that of earlier frames by {1000 * match.sigma:.0f} um"
     if match.relief < options.min_relief:
-        return "its surface is too flat to be held in place by its shape"
+        return "its surface is too flat to determine its pose"
     return None
 
 
@@ -386,7 +386,7 @@ def glare_notes(handpiece: Handpiece) -> tuple[str, ...]:
     if handpiece.lights and all(light.glare <= _LITTLE_GLARE for light in handpiece.lights.values()):
         return ()
     return (
-        "depth: as far as the handpiece file tells (glare of each light), there are no crossed polarisers: in "
+        "depth: according to the handpiece file (glare of each light), there are no crossed polarisers: in "
         "simulation, mirror reflections of wet teeth hide from a sixth (six coloured lights in turn) to half of the "
         "surface (white lights, and 0.03 mm of error); use polarisers or powder",
     )
@@ -409,7 +409,7 @@ def _require_enough(
     if placed >= options.min_located * total and (placed > 1 or total == 1):
         return
     shown = "; ".join(f"{each.what}: {each.reason}" for each in dropped[:3])
-    polarisers = "cross polarisers (the handpiece file tells of none), " if glare_notes(handpiece) else ""
+    polarisers = "cross polarisers (the handpiece file states none), " if glare_notes(handpiece) else ""
     raise ReconstructionError(
         f"motion: only {placed} of {total} frames could be placed by their surfaces ({shown}); {polarisers}take frames "
         "closer together, see that the lights are on and nothing else shines, or give the surface texture (powder)"

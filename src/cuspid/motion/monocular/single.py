@@ -499,7 +499,8 @@ def weak_stretch_notes(frames: Sequence[FrameUse]) -> tuple[str, ...]:
     described = [_describe_stretch(stretch) for stretch in stretches[:_MOST_TOLD]]
     more = f", and at {len(stretches) - len(described)} other places" if len(stretches) > len(described) else ""
     return (
-        f"the path is held loosely at {', '.join(described)}{more}, where {usual:.0f} are usual: it may bend there "
+        f"the path is weakly constrained at {', '.join(described)}{more}, where {usual:.0f} are usual: it may bend "
+        f"there "
         "(camera_path.png); film there again, more slowly",
     )
 

@@ -70,7 +70,7 @@ class ReportOptions(Options):
 
 
 _NO_SCALE = (
-    "scale: nothing tells it, so all lengths and areas are in a unit of this surface's own, not in millimetres or "
+    "scale: unknown, so all lengths and areas are in an arbitrary unit, not in millimetres or "
     "micrometres, whatever is written beside them"
 )
 

@@ -111,7 +111,7 @@ def _rows(document: Document) -> list[list[str]]:
 def _image_rows(document: Document) -> list[list[str]]:
     """Those of the images: of each pair of lines the first, the second has its points and may be empty."""
     if document.kind != "text":
-        raise InputError("images.txt is no list of COLMAP's images")
+        raise InputError("images.txt is not a list of COLMAP's images")
     lines = [line.split() for line in document.value.splitlines() if not line.startswith("#")]
     rows = [row for row in lines[::2] if row]
     if any(len(row) < 10 for row in rows):

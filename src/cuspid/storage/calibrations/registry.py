@@ -152,7 +152,7 @@ def _recognise(files: Mapping[str, Document]) -> Name:
         if each.recognises(files):
             return name
     known = ", ".join(FORMATS)
-    raise InputError(f"it is no calibration that is known ({known}); cuspid rig convert takes it with --from")
+    raise InputError(f"it is no known calibration format ({known}); name it with cuspid rig convert --from")
 
 
 def _unit(format: Format, found: Calibration, given: Unit | None) -> tuple[Unit, tuple[str, ...]]:
@@ -167,7 +167,7 @@ def _unit(format: Format, found: Calibration, given: Unit | None) -> tuple[Unit,
         return usual, ()
     candidates: tuple[Unit, ...] = (usual, "m", "mm")
     likely = next((each for each in candidates if _NEAREST_MM <= apart * MM_PER_UNIT[each] <= _FARTHEST_MM), usual)
-    note = f"the file tells no unit of length; {likely} is assumed: its cameras are up to {apart:.4g} {likely} apart"
+    note = f"the file states no unit of length; {likely} is assumed: its cameras are up to {apart:.4g} {likely} apart"
     return likely, (f"{note} (--unit)",)
 
 
