@@ -6,7 +6,8 @@ Puts the figures of today's results into the pages; with ``--check`` it only say
 documentation does. A text of quoted.toml stands on its page with a figure in place of each ``{}``, and is followed by
 where each is from:
 
-    NAMES: PATH [& NAMES: PATH ...] FORMAT [median|rms|max] [* FACTOR]     a figure, "20-22" where there are several
+    NAMES: PATH [& NAMES: PATH ...] FORMAT [median|rms|max] [* FACTOR]     a figure, "20-22" where there are several;
+                                                                           without its sign unless FORMAT has one
     NAMES: PATH <= LIMIT [and NAMES: PATH >= LIMIT ...]                    "met" or "missed", by the size of each value
 
 Names of results and the parts of a path may have wildcards. A table with a quoted text has no other figures.
@@ -27,7 +28,7 @@ from typing import Any
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 
-FIGURE = re.compile(r"(?P<where>.+?) (?P<digits>\.\df)(?: (?P<one>\w+))?(?: \* (?P<factor>\S+))?")
+FIGURE = re.compile(r"(?P<where>.+?) (?P<digits>\+?\.\df)(?: (?P<one>\w+))?(?: \* (?P<factor>\S+))?")
 BAR = re.compile(r"(?P<where>.+) (?P<sign>[<>])= (?P<limit>\S+)")
 ONE: Mapping[str, Callable[[Sequence[float]], float]] = {
     "median": median,
@@ -80,7 +81,8 @@ def _pattern(text: str) -> re.Pattern[str]:
 def _told(source: str, results: Results) -> str:
     """A figure, or whether bars are met."""
     if found := FIGURE.fullmatch(source):
-        values = [value * float(found["factor"] or 1) for value in _values(found["where"], results)]
+        signed = [value * float(found["factor"] or 1) for value in _values(found["where"], results)]
+        values = signed if found["digits"].startswith("+") else [abs(value) for value in signed]
         ends = [ONE[found["one"]](values)] if found["one"] else [min(values), max(values)]
         return "-".join(dict.fromkeys(f"{end:{found['digits']}}" for end in ends))
     bars = [BAR.fullmatch(each) for each in source.split(" and ")]
@@ -90,15 +92,15 @@ def _told(source: str, results: Results) -> str:
 def _is_met(bar: re.Match[str] | None, source: str, results: Results) -> bool:
     if bar is None:
         raise WrongFigureError(f"{source} is neither a figure nor a bar")
-    values, limit = _values(bar["where"], results), float(bar["limit"])
+    values, limit = [abs(value) for value in _values(bar["where"], results)], float(bar["limit"])
     return max(values) <= limit if bar["sign"] == "<" else min(values) >= limit
 
 
 def _values(where: str, results: Results) -> list[float]:
-    """Sizes of the figures on paths through the results of some names."""
+    """Figures on paths through the results of some names."""
     places = [place.split(": ") for place in where.split(" & ")]
     found = [
-        abs(float(value))
+        float(value)
         for names, path in places
         for name, result in results.items()
         if fnmatchcase(name, names)
