@@ -567,7 +567,10 @@ def _angle_line(angles: tuple[float, ...], narrow: Mouth) -> ThesisLine:
 def _depth_line(angles: tuple[float, ...]) -> ThesisLine:
     length = _ARCH_LENGTHS_MM["Lower-14"]
     printed = _projection_mm(angles, length)
-    exact = [_distance_mm(radius, angle, length) for radius, angle in zip(_RADII_MM, angles, strict=True)]
+    exact = [
+        float(np.sqrt(radius**2 + length**2 - 2 * radius * length * np.cos(angle)))
+        for radius, angle in zip(_RADII_MM, angles, strict=True)
+    ]
     return ThesisLine(
         what="Eq. 2.3: d = r - f cos(alpha), mm (Lower-14)",
         printed="no number",
@@ -597,8 +600,3 @@ def _gap_line(angles: tuple[float, ...], narrow: Mouth, wide: Mouth) -> ThesisLi
 def _projection_mm(angles: tuple[float, ...], length_mm: float) -> list[float]:
     """d of Eq. 2.3 as printed, for each r."""
     return [radius - length_mm * float(np.cos(angle)) for radius, angle in zip(_RADII_MM, angles, strict=True)]
-
-
-def _distance_mm(radius_mm: float, angle_rad: float, length_mm: float) -> float:
-    """Hinge axis to a tooth that lies behind the incisors by a length along the occlusal plane."""
-    return float(np.sqrt(radius_mm**2 + length_mm**2 - 2 * radius_mm * length_mm * np.cos(angle_rad)))

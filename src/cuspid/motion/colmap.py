@@ -441,12 +441,10 @@ def from_colmap(model: ColmapModel, capture: Capture, source: str) -> Reconstruc
         ),
         log={"mm_per_model_unit": scale, "scale_spread": spread},
     )
-    return found if found.tracks is None else replace(found, reprojection_rms_px=_rms(residuals_px(found)))
-
-
-def _rms(residuals: Float[np.ndarray, "o 2"]) -> float:
-    """RMS length of the residuals; those behind a camera do not count."""
-    return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
+    if found.tracks is None:
+        return found
+    rms_px = float(np.sqrt(np.nanmean(np.sum(residuals_px(found) ** 2, axis=1))))  # without those behind a camera
+    return replace(found, reprojection_rms_px=rms_px)
 
 
 def read_model(folder: Path, capture: Capture) -> Reconstruction:

@@ -135,7 +135,7 @@ def check_features(
     moved = np.flatnonzero(slots != own)
     agreeing, after = matches.agreeing_as(own, _LOOSE_PX), matches.agreeing_as(slots)
     before, gained = (int(each[moved].sum()) for each in (agreeing, after))
-    ties = _ties(after, matches.counts)[moved]
+    ties = ((after >= _LEAST) & (after >= _TIED_SHARE * matches.counts))[moved]
     tied = ties.any(axis=1).all() and (after[moved][ties].sum() >= _NAMED_SHARE * matches.counts[moved][ties].sum())
     if len(moved) and tied and (gained >= _GAIN * before or motion.is_preferred(slots, own)):
         taken_by = {names[k]: names[slots[k]] for k in moved}
@@ -225,11 +225,6 @@ class _Matches:
                     if p != q:
                         found[i, j, p, q] = found[j, i, q, p] = self.agreeing((i, j), (p, q))
         return found
-
-
-def _ties(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c c"]:
-    """Which images agree with which others."""
-    return np.asarray((agreeing >= _LEAST) & (agreeing >= _TIED_SHARE * counts))
 
 
 def _fits(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c"]:

@@ -55,7 +55,7 @@ def sweep(
     for number, q in enumerate(labels):
         seen = []
         for (other, to_other), a, b in zip(others, geometry.infinite, geometry.parallax, strict=True):
-            homography = np.linalg.inv(to_other) @ (a + q * _column(b)) @ to_full
+            homography = np.linalg.inv(to_other) @ (a + q * np.outer(b, [0.0, 0.0, 1.0])) @ to_full
             seen.append(_zncc(one, mean, variance, *_warp_image(other, homography, one.shape), noise_dn))
         # Half of the sources may look past what is in front of the surface there.
         best = np.sort(np.stack(seen), axis=0)[len(seen) // 2 :]
@@ -64,11 +64,6 @@ def sweep(
     at = np.take_along_axis(zncc, np.rint(chosen).astype(np.int64)[..., None], axis=2)[..., 0]
     q = np.where(at >= _LEAST_ZNCC, np.clip(low + step * chosen, low, high), np.nan)
     return _sample_grid(q, np.linalg.inv(to_full), (height, width), spacing_px), SIGMA_PX / scale
-
-
-def _column(parallax: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """What adds the parallax to the third column of a homography."""
-    return np.outer(parallax, [0.0, 0.0, 1.0])
 
 
 def _downsample(

@@ -284,7 +284,7 @@ class _Layers:
         for level, sigma in enumerate([*sigmas, sigmas[-1]]):
             last = level == len(sigmas)
             coarser = np.zeros_like(finer) if last else _masked_blur(finer, valid, sigma)
-            weight = valid * _soft(chosen, sigma)
+            weight = valid * _gaussian(chosen, 2 * sigma)
             layers.bands.append((finer - coarser) * weight[..., None])
             layers.weights.append(weight)
             if not last:
@@ -312,11 +312,6 @@ class _Bands:
         for band, weight in zip(self.sums, self.weights, strict=True):
             total += band / np.maximum(weight, 1e-6)[..., None]
         return total
-
-
-def _soft(mask: Float[np.ndarray, "h w"], sigma: float) -> Float[np.ndarray, "h w"]:
-    """A mask whose edge fades over about 2 sigma."""
-    return np.asarray(_gaussian(mask, 2 * sigma))
 
 
 def _gaussian(array: np.ndarray, sigma: float) -> np.ndarray:

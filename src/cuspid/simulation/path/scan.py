@@ -158,7 +158,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     be seen from where the handpiece fits, or the given number of frames is too small for the overlap.
     """
     curve, room = arch_curve(jaw), room_about(jaw.mesh, handpiece, options.clearance_mm)
-    crowns = crown_points(jaw, curve, _reach_mm(handpiece))
+    crowns = crown_points(jaw, curve, handpiece.depth_range_mm[1])
     steady = first = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
     if _needs_further_passes(options, curve):
         steady = further_legs(jaw.mesh, room, crowns, handpiece, first)
@@ -248,11 +248,6 @@ def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[floa
         length = TOOTH_PATH_MM
     middle, half = (first + last) / 2, (options.length_mm or length) / 2
     return middle - half, middle + half
-
-
-def _reach_mm(handpiece: Handpiece) -> float:
-    """How far from a point of the surface something may hide it."""
-    return handpiece.depth_range_mm[1]
 
 
 def _apply_drift(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:

@@ -131,16 +131,12 @@ def mean_estimate(groups: Sequence[Float[np.ndarray, "_"]], rng: np.random.Gener
     freedom = sum(len(group) - 1 for group in groups)
     if freedom < _LEAST_SCANS - 1:
         return Estimate(value=value, low=None, high=None)
-    draws = np.mean([_means_of_draws(group, rng) for group in groups], axis=0)
+    draws = np.mean([group[rng.integers(0, len(group), (_DRAWS, len(group)))].mean(axis=1) for group in groups], axis=0)
     size = len(groups) + freedom
     reach = float(stats.t.ppf(0.5 + LEVEL / 2, freedom)) * np.sqrt(size / freedom)
     share = float(stats.norm.cdf(-reach))
     low, high = np.quantile(draws, [share, 1 - share])
     return Estimate(value=value, low=float(low), high=float(high))
-
-
-def _means_of_draws(group: Float[np.ndarray, "n"], rng: np.random.Generator) -> Float[np.ndarray, "d"]:
-    return group[rng.integers(0, len(group), (_DRAWS, len(group)))].mean(axis=1)
 
 
 def precision_estimate(groups: Sequence[Float[np.ndarray, "_ _"]]) -> Estimate:
