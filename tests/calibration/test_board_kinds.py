@@ -14,7 +14,7 @@ from boards import SIZE, options, photograph, pose_before, scene, undistorted
 from cuspid import storage
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.calibrate import CalibrationOptions, _calibrate_once, calibrate_rig
-from cuspid.calibration.circle_centres import centre_shifts, measured_share
+from cuspid.calibration.circle_centres import centre_shifts, measure_circle_share
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
@@ -233,7 +233,7 @@ def test_circles_of_another_size_are_told(tmp_path: Path, board: Board) -> None:
     for k, (tilt, roll) in enumerate([(0, 10), (35, 20), (-35, 90)]):
         image = photograph(board, camera, pose_before(board, 18.0, tilt, roll_deg=roll), 3, seed=k)
         storage.write_image(tmp_path / "images" / "cam" / f"{k}.png", np.repeat(image[..., None], 3, axis=2))
-        assert measured_share(image, board) == pytest.approx(board.circle_share, rel=0.04)
+        assert measure_circle_share(image, board) == pytest.approx(board.circle_share, rel=0.04)
     given = [*options(replace(board, circle_share=0.8)), "--lens", "OPENCV", "--no-photometry"]
     run("calibrate", tmp_path / "images", "--out", tmp_path / "rig", *given)
     told = " ".join(storage.read_json(tmp_path / "rig" / "calibration.json")["notes"])

@@ -74,7 +74,7 @@ def test_the_board_sets_the_scale(model, photographs):
     assert 0 < abs(scale.mm_per_unit / expected - 1) < 0.001
     assert 0 < scale.sigma_share < 0.001
     assert not scale.notes
-    located = photograph_pipeline.handed_over(model, photographs, scale)
+    located = photograph_pipeline.to_capture(model, photographs, scale)
     assert located.found.has_scale
     depth = np.concatenate([depth[np.isfinite(depth)] for depth in scene().depths.values()])
     near, far = located.capture.handpiece.depth_range_mm
@@ -191,7 +191,7 @@ def test_twice_the_size_has_twice_the_focal_length(model, tmp_path):
 
 
 def test_given_poses_are_taken(model, photographs, tmp_path):
-    located = photograph_pipeline.handed_over(model, photographs, None)
+    located = photograph_pipeline.to_capture(model, photographs, None)
     files = {name: f"{name}.JPG" for name in model.frames}
     write_model(tmp_path / "sparse", located.found, located.capture, files)
     half = tmp_path / "half"
@@ -212,7 +212,7 @@ def test_given_poses_are_taken(model, photographs, tmp_path):
 
 
 def test_poses_of_other_photographs_are_refused(model, photographs, tmp_path):
-    located = photograph_pipeline.handed_over(model, photographs, None)
+    located = photograph_pipeline.to_capture(model, photographs, None)
     write_model(tmp_path, located.found, located.capture, {name: f"other-{name}.png" for name in model.frames})
     with pytest.raises(InputError, match=r"named like other-IMG_00\.png"):
         take_photograph_poses(photographs, tmp_path)

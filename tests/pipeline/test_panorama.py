@@ -22,7 +22,7 @@ from cuspid.model.reconstruction import Tracks
 from cuspid.model.sparse_model import SparseModel
 from cuspid.model.trueness import GroundTruth
 from cuspid.motion.monocular.single import SingleOptions, locate_single, mouth_share, normalise_contrast
-from cuspid.pipeline.panorama import StitchOptions, stitch, that_show_something
+from cuspid.pipeline.panorama import StitchOptions, require_content, stitch
 from cuspid.pipeline.scan import RenderOptions, take_images
 from cuspid.runtime.errors import InputError, ReconstructionError
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
@@ -117,7 +117,7 @@ def test_overlaps_inliers_and_notes_are_told(stitched: Stitched) -> None:
 def test_a_path_that_the_surface_does_not_hold_stays_and_a_note_tells(
     sequence: ImageSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cuspid.pipeline.panorama.that_show_something", tuple)  # there is no picture without a surface
+    monkeypatch.setattr("cuspid.pipeline.panorama.require_content", tuple)  # there is no picture without a surface
     options = StitchOptions(plane_sweep=PlaneSweepOptions(agreement=0.99))
     (made,) = stitch(sequence, options)
     assert all(frame.used for frame in made.panorama.frames)
@@ -248,17 +248,17 @@ def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: 
 
 def test_an_empty_picture_is_no_panorama(stitched: Stitched) -> None:
     """Of frames that hardly overlap it was one of status 0 without a pixel."""
-    assert that_show_something([stitched]) == (stitched,)
+    assert require_content([stitched]) == (stitched,)
     nothing = np.zeros_like(stitched.panorama.covered)
     empty = replace(stitched, panorama=replace(stitched.panorama, covered=nothing))
-    assert len(that_show_something([empty, stitched])) == 2
+    assert len(require_content([empty, stitched])) == 2
     with pytest.raises(ReconstructionError, match=rf"the {FRAMES} frames that were placed give no picture; take them"):
-        that_show_something([empty])
+        require_content([empty])
     assert stitched.motion is not None
     tracks = stitched.motion.tracks
     few = replace(tracks, **{name: getattr(tracks, name)[:40] for name in OF_OBSERVATIONS})
     with pytest.raises(ReconstructionError, match=r"no picture, as neighbours share only \d+ points; take them"):
-        that_show_something([replace(empty, motion=replace(stitched.motion, tracks=few))])
+        require_content([replace(empty, motion=replace(stitched.motion, tracks=few))])
 
 
 OF_OBSERVATIONS = ("point_index", "frame_index", "camera_index", "pixels")

@@ -19,7 +19,13 @@ from cuspid.model.reconstruction import Reconstruction, Tracks
 from cuspid.model.trueness import GroundTruth
 from cuspid.motion.bundle.adjustment import AdjustmentOptions
 from cuspid.motion.monocular.single import SingleOptions
-from cuspid.motion.rig_film import film_options, locate_rig_film, of_camera, refine_rig_on_surface, surface_patches
+from cuspid.motion.rig_film import (
+    film_options,
+    locate_rig_film,
+    refine_rig_on_surface,
+    surface_patches,
+    trajectory_of_camera,
+)
 from cuspid.pipeline.panorama import StitchOptions, stitch_rig
 from cuspid.pipeline.scan import RenderOptions, take_images
 from cuspid.stitching.compared import camera_gains, cameras_beside
@@ -164,7 +170,7 @@ def test_a_frame_that_lacks_an_image_is_left_out_where_it_is_missing(film: tuple
         expected = rig[first].cam_from_rig @ truth.rig_from_world[frame]
         np.testing.assert_array_equal(beside.cam_from_world[one].matrix, expected.matrix)
     with_left = {frame.name for frame in frames if "left" in frame.cameras}
-    model = of_camera(found, "left", with_left)
+    model = trajectory_of_camera(found, "left", with_left)
     assert list(model.frames) == [frame.name for frame in frames if frame.name in with_left]
     assert [model.frames[k] for k in model.tracks.frame_index] == [frames[3].name, frames[6].name]
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid.geometry import Rigid3
-from cuspid.geometry.gloss import leaving
+from cuspid.geometry.gloss import transmittance
 from cuspid.model.camera import Camera
 from cuspid.model.reconstruction import Tracks
 from cuspid.model.sparse_model import SparseModel
@@ -429,7 +429,7 @@ def instants(index: float, paint: Callable[[np.ndarray], np.ndarray]) -> Scene:
             turn = Rigid3.from_rotation_vector(np.array([0.0, np.arctan2(x, CAMERA_MM), 0]), np.zeros(3))
             pose = turn @ down @ place
             places, cosines = on_hill(pose, CAMERA)
-            light = paint(places) * np.vectorize(leaving)(np.clip(np.nan_to_num(cosines), 0.1, 1), index)
+            light = paint(places) * np.vectorize(transmittance)(np.clip(np.nan_to_num(cosines), 0.1, 1), index)
             gray = np.where(np.abs(places[..., 0]) < RIM_MM, 255 * np.clip(light, 0, 1) ** (1 / 2.2), 0)
             poses[f"{name}/{instant}"] = pose
             images[f"{name}/{instant}"] = np.dstack([np.rint(gray).astype(np.uint8)] * 3)

@@ -47,11 +47,17 @@ class Labelling:
         """The labels of a file in FDI numbers, for its mesh in the occlusal frame; see :func:`number_teeth`."""
         table = None if self.label_map is None else read_label_map(self.label_map)
         return number_teeth(
-            str(path), labels, mesh, arch=arch or named_arch(path), sure=sure, numbering=self.numbering, label_map=table
+            str(path),
+            labels,
+            mesh,
+            arch=arch or arch_from_name(path),
+            sure=sure,
+            numbering=self.numbering,
+            label_map=table,
         )
 
 
-def named_arch(path: Path) -> Arch | None:
+def arch_from_name(path: Path) -> Arch | None:
     """The arch that the name of a file says: ``lower`` or ``upper`` stands in it."""
     named = [arch for arch in ARCHES if arch in path.stem.lower()]
     return named[0] if len(named) == 1 else None
@@ -157,7 +163,7 @@ def load_landmarked_jaw(
     beside = (path.with_suffix(suffix) for suffix in (".landmarks.json", MARKUPS_SUFFIX))
     file = landmarks or next((each for each in beside if is_there(each)), None)
     jaw, notes, occlusal_from_mesh = _load_oriented(
-        path, unit, arch or named_arch(path), labelling, needs_teeth=file is None
+        path, unit, arch or arch_from_name(path), labelling, needs_teeth=file is None
     )
     if file is not None:
         given = read_landmarks(file)

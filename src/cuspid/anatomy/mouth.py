@@ -566,7 +566,7 @@ def _angle_line(angles: tuple[float, ...], narrow: Mouth) -> ThesisLine:
 
 def _depth_line(angles: tuple[float, ...]) -> ThesisLine:
     length = _ARCH_LENGTHS_MM["Lower-14"]
-    printed = _projected_mm(angles, length)
+    printed = _projection_mm(angles, length)
     exact = [_distance_mm(radius, angle, length) for radius, angle in zip(_RADII_MM, angles, strict=True)]
     return ThesisLine(
         what="Eq. 2.3: d = r - f cos(alpha), mm (Lower-14)",
@@ -578,8 +578,8 @@ def _depth_line(angles: tuple[float, ...]) -> ThesisLine:
 
 
 def _gap_line(angles: tuple[float, ...], narrow: Mouth, wide: Mouth) -> ThesisLine:
-    every = [_TURN_RAD * depth for length in _ARCH_LENGTHS_MM.values() for depth in _projected_mm(angles, length)]
-    lower = [_TURN_RAD * depth for depth in _projected_mm(angles, _ARCH_LENGTHS_MM["Lower-14"])]
+    every = [_TURN_RAD * depth for length in _ARCH_LENGTHS_MM.values() for depth in _projection_mm(angles, length)]
+    lower = [_TURN_RAD * depth for depth in _projection_mm(angles, _ARCH_LENGTHS_MM["Lower-14"])]
     behind = float(tooth_ends_mm(Anatomy().molar_depth_mm.mean)[-1])
     model = [float(np.asarray(mouth.gap_mm(behind))) for mouth in (narrow, wide)]
     return ThesisLine(
@@ -594,7 +594,7 @@ def _gap_line(angles: tuple[float, ...], narrow: Mouth, wide: Mouth) -> ThesisLi
     )
 
 
-def _projected_mm(angles: tuple[float, ...], length_mm: float) -> list[float]:
+def _projection_mm(angles: tuple[float, ...], length_mm: float) -> list[float]:
     """d of Eq. 2.3 as printed, for each r."""
     return [radius - length_mm * float(np.cos(angle)) for radius, angle in zip(_RADII_MM, angles, strict=True)]
 

@@ -13,19 +13,19 @@ _AGREE_DEG, _AGREE_SHARE = 5.0, 0.1
 that of the board."""
 
 
-def agreed_on(said: Sequence[Sequence[Rigid3]], distance_mm: float) -> tuple[Rigid3, int]:
+def consensus_motion(candidates: Sequence[Sequence[Rigid3]], distance_mm: float) -> tuple[Rigid3, int]:
     """Of the motions that each instant leaves open, the one that the most instants agree with, and how many do."""
 
     def support(candidate: Rigid3) -> tuple[int, float]:
-        nearest = [min(apart(each, candidate) for each in options) for options in said]
+        nearest = [min(motion_difference(each, candidate) for each in options) for options in candidates]
         agreeing = [turn for turn, shift in nearest if turn < _AGREE_DEG and shift < _AGREE_SHARE * distance_mm]
         return len(agreeing), -float(np.median([turn for turn, _ in nearest]))
 
-    best = max((each for options in said for each in options), key=support)
+    best = max((each for options in candidates for each in options), key=support)
     return best, support(best)[0]
 
 
-def apart(one: Rigid3, other: Rigid3) -> tuple[float, float]:
+def motion_difference(one: Rigid3, other: Rigid3) -> tuple[float, float]:
     """The turn between two motions, degrees, and the distance, mm."""
     between = one @ other.inverse()
     return between.angle_deg, float(np.linalg.norm(one.translation - other.translation))

@@ -78,8 +78,8 @@ class BoardShape:
         offsets = (flat - modes.T @ (modes @ flat)).reshape(-1, 3)
         sigma = []
         for axes, was in zip((slice(0, 2), slice(2, 3)), self.sigma_mm, strict=True):
-            told = variance_mm2[:, axes].size - variance_mm2[:, axes].sum() / was**2
-            seen = np.sum(offsets[:, axes] ** 2) / max(float(told), 1e-3)
+            dof = variance_mm2[:, axes].size - variance_mm2[:, axes].sum() / was**2
+            seen = np.sum(offsets[:, axes] ** 2) / max(float(dof), 1e-3)
             sigma.append(max(float(np.sqrt(seen)), _FLAT * board.square_mm))
         return replace(self, sigma_mm=(sigma[0], sigma[1]))
 

@@ -18,21 +18,21 @@ from cuspid.calibration.bundle import (
     BoardScene,
     Timing,
     adjust_board,
-    at_middle_rows,
     common_free,
-    in_front,
     mounted_cameras,
-    of_instants,
     readout_score,
     readout_sigmas,
+    select_instants,
     unevenness_score,
+    views_at_middle_rows,
+    views_in_front,
 )
 from cuspid.calibration.circle_centres import centre_shifts
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, split_by_board
-from cuspid.calibration.joining import joined_boards
-from cuspid.calibration.lenses import LensChoice, LensName, choose_lens, splined_where_earned
+from cuspid.calibration.joining import join_boards
+from cuspid.calibration.lenses import LensChoice, LensName, choose_lens, select_splined_lens
 from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, join_cameras, renumber_instant, require_one_group
-from cuspid.calibration.timing import adjust_scene, allow_delays, follow_each_other, rolling
+from cuspid.calibration.timing import adjust_scene, allow_delays, allow_rolling, are_consecutive
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.camera import Camera
@@ -205,19 +205,19 @@ def _calibrate_once(
             f"calibration: {', '.join(few)} saw the board at fewer than {LEAST_VIEWS} instants; check that the "
             "columns, rows, dictionary and kind of the board match the images"
         )
-    lenses = {name: _alone(name, views, board, size, options.lens) for name, size in sizes.items()}
+    lenses = {name: _choose_camera_lens(name, views, board, size, options.lens) for name, size in sizes.items()}
     choices = {name: choice for name, (choice, _) in lenses.items()}
     alone = {name: each for name, (_, each) in lenses.items()}
     cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
-    how: tuple[str, ...] = ()
+    notes_joining: tuple[str, ...] = ()
     if isinstance(board, BoardSet):
-        start, common, how = joined_boards(views, board, cameras)
+        start, common, notes_joining = join_boards(views, board, cameras)
     else:
         start, common = join_cameras(views, board, cameras, sorted({instant for _, instant in views}))
 
     def attempt(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
         found, chosen, notes = _fit_cameras(scene, common, board, options)
-        return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes), options.frames_per_s))
+        return _Trial(found, _describe(found, chosen, board, lenses, (*notes_joining, *notes), options.frames_per_s))
 
     best = _with_timing(attempt(start), start, common, board, options, attempt)
     splined = _find_splines(best, choices, board) if options.lens == "auto" else {}
@@ -228,7 +228,7 @@ def _calibrate_once(
         scene = replace(scene, cameras=cameras, rig_from_board=poses, loose_px=0.0, shape=None)
         with suppress(ReconstructionError):  # together with the other cameras
             better = attempt(scene, {**choices, **{name: choice for name, (choice, _) in splined.items()}})
-            best = better if _keeps_most(better.described, best.described) else best
+            best = better if _retains_most_views(better.described, best.described) else best
     return best.described
 
 
@@ -236,10 +236,10 @@ def _find_splines(
     best: _Trial, choices: Mapping[str, LensChoice], board: Target
 ) -> dict[str, tuple[LensChoice, Camera]]:
     """Cameras whose views call for a splined lens, once it is known when each row was exposed."""
-    views, found = at_middle_rows(best.found.scene, best.described.views, board), {}
+    views, found = views_at_middle_rows(best.found.scene, best.described.views, board), {}
     for name, camera in best.found.scene.cameras.items():
         own = [part for (one, _), view in views.items() if one == name for part in split_by_board(view, board)]
-        splined = splined_where_earned(choices[name], camera, own, board)
+        splined = select_splined_lens(choices[name], camera, own, board)
         if splined is not None:
             found[name] = splined
     return found
@@ -255,11 +255,11 @@ def _with_timing(
 ) -> _Trial:
     """With delays of the cameras and readouts, where these explain more."""
     frame = frame_numbers(start.rig_from_board)
-    if frame is None or not follow_each_other(frame):
+    if frame is None or not are_consecutive(frame):
         return best
 
     def may_roll(scene: BoardScene, used: Views) -> bool:
-        return options.shutter == "auto" and readout_score(rolling(scene, frame, used), used, board) > _ROLLING
+        return options.shutter == "auto" and readout_score(allow_rolling(scene, frame, used), used, board) > _ROLLING
 
     doubtful = any(_is_doubtful_together(check) for check in best.described.cameras.values())
     if len(start.cameras) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
@@ -270,8 +270,8 @@ def _with_timing(
         return best
     scene = replace(best.found.scene, rig_from_board={**start.rig_from_board, **best.found.scene.rig_from_board})
     with suppress(ReconstructionError):  # nor readouts
-        rolled = attempt(rolling(replace(scene, loose_px=0.0, shape=None), frame, common))
-        best = rolled if _rolls(rolled, board) and _keeps_most(rolled.described, best.described) else best
+        rolled = attempt(allow_rolling(replace(scene, loose_px=0.0, shape=None), frame, common))
+        best = rolled if _rolls(rolled, board) and _retains_most_views(rolled.described, best.described) else best
     return best
 
 
@@ -297,10 +297,10 @@ def _rolls(rolled: _Trial, board: Target) -> bool:
 def _is_better(apart: RigCalibration, together: RigCalibration) -> bool:
     """Whether delays explain images that they were not estimated from, and not by leaving out views."""
     before, after = _held_out_px(together), _held_out_px(apart)
-    return bool(np.isfinite(before) and after < _LESS * before and _keeps_most(apart, together))
+    return bool(np.isfinite(before) and after < _LESS * before and _retains_most_views(apart, together))
 
 
-def _keeps_most(one: RigCalibration, other: RigCalibration) -> bool:
+def _retains_most_views(one: RigCalibration, other: RigCalibration) -> bool:
     """Whether a calibration is made from about as many views as another."""
     return len(one.views) > _LESS * len(other.views)
 
@@ -321,7 +321,7 @@ def _held_out_px(found: RigCalibration) -> float:
     return _rms(np.array([np.inf if check.held_out_px is None else check.held_out_px for check in checks]))
 
 
-def _alone(
+def _choose_camera_lens(
     name: str, views: Views, board: Target, size: tuple[int, int], lens: LensName
 ) -> tuple[LensChoice, Adjusted]:
     try:
@@ -342,14 +342,14 @@ def _fit_cameras(
     The cameras need not see the board at quite the same place. It is taken to be uneven where that explains instants
     better, by more than chance, that it was not estimated from.
     """
-    found, notes = _without_outliers(start, views, board, options)
+    found, notes = _adjust_robustly(start, views, board, options)
     if len(start.cameras) > 1:
         loose = replace(found.scene, loose_px=found.sigma_px)
         found = adjust_scene(loose, {key: views[key] for key in found.residuals}, board)
     used = {key: views[key] for key in found.residuals}
     if not is_grid_of_corners(board) or unevenness_score(found, used, board) < _EVEN:
         return found, views, notes
-    uneven, turned = _uneven(found, views, board)
+    uneven, turned = _estimate_unevenness(found, views, board)
     if uneven.scene.shape is None or uneven.scene.shape.is_even(board):
         return found, views, notes
     used = {key: turned[key] for key in found.residuals}
@@ -359,7 +359,7 @@ def _fit_cameras(
     return found, views, notes
 
 
-def _uneven(found: Adjusted, views: Views, board: Board) -> tuple[Adjusted, Views]:
+def _estimate_unevenness(found: Adjusted, views: Views, board: Board) -> tuple[Adjusted, Views]:
     """The cameras before a board that may be uneven, and the views with the numbering of their corners that it
     shows."""
     found = adjust_scene(
@@ -398,9 +398,9 @@ def _explains_more(one: Adjusted, other: Adjusted, views: Views, board: Board) -
 
 def _squares_without(scene: BoardScene, rest: Views, out: Views, board: Board) -> dict[str, float]:
     """Mean squares of the residuals at some instants by a calibration from others."""
-    found = adjust_scene(of_instants(scene, {key[1] for key in rest}), rest, board, keep_scales=True)
+    found = adjust_scene(select_instants(scene, {key[1] for key in rest}), rest, board, keep_scales=True)
     held = replace(found.scene, rig_from_board=scene.rig_from_board, timing=scene.timing)
-    held = of_instants(held, {key[1] for key in out})
+    held = select_instants(held, {key[1] for key in out})
     residuals = adjust_scene(held, out, board, only_boards=True).residuals
     instants = {key[1] for key in out}
     return {
@@ -409,21 +409,21 @@ def _squares_without(scene: BoardScene, rest: Views, out: Views, board: Board) -
     }
 
 
-def _without_outliers(
+def _adjust_robustly(
     scene: BoardScene, views: Views, board: Target, options: CalibrationOptions
 ) -> tuple[Adjusted, tuple[str, ...]]:
     """Adjust, leave out the views that do not fit, and again."""
-    sound = in_front(scene, views, board)
+    sound = views_in_front(scene, views, board)
     notes = [
         f"camera {camera}, {instant}: left out, no pose of the board explains it"
         for camera, instant in views
         if (camera, instant) not in sound
     ]
-    views, scene = sound, of_instants(scene, {instant for _, instant in sound})
+    views, scene = sound, select_instants(scene, {instant for _, instant in sound})
     _require_views(views, scene)
     for _ in range(options.rounds):
         found = adjust_scene(scene, views, board)
-        bad = _odd_ones(found, options)
+        bad = _outlying_views(found, options)
         if not bad:
             return found, tuple(notes)
         notes += [
@@ -433,11 +433,11 @@ def _without_outliers(
         ]
         views = {key: view for key, view in views.items() if key not in bad}
         _require_views(views, scene)
-        scene = of_instants(found.scene, {instant for _, instant in views})
+        scene = select_instants(found.scene, {instant for _, instant in views})
     return adjust_scene(scene, views, board), tuple(notes)
 
 
-def _odd_ones(found: Adjusted, options: CalibrationOptions) -> dict[tuple[str, str], tuple[float, float]]:
+def _outlying_views(found: Adjusted, options: CalibrationOptions) -> dict[tuple[str, str], tuple[float, float]]:
     """Views that do not fit: their RMS, and what is usual over all or for their camera, px."""
     rms = {key: _rms(residuals) for key, residuals in found.residuals.items()}
     usual = {
@@ -491,10 +491,10 @@ def size_notes(found: Rig, drawn: Rig, board: Target) -> tuple[str, ...]:
     growth = sizes[0] / max(sizes[1], 1e-9) - 1
     if abs(growth) < _ODD_SIZE:
         return ()
-    how = "farther apart" if growth > 0 else "closer together"
+    direction = "farther apart" if growth > 0 else "closer together"
     return (
-        f"the cameras lie {abs(growth):.1%} {how} than drawn: was --square-mm {board.square_mm:g} measured on the "
-        f"print? With {board.square_mm / (1 + growth):.3g} they lie as drawn",
+        f"the cameras lie {abs(growth):.1%} {direction} than drawn: was --square-mm {board.square_mm:g} measured on "
+        f"the print? With {board.square_mm / (1 + growth):.3g} they lie as drawn",
     )
 
 
@@ -514,7 +514,7 @@ def _describe(
     pixels = {name: np.concatenate([views[key].pixels for key in of[name]]) for name in names}
     residuals = {name: np.concatenate([found.residuals[key] for key in of[name]]) for name in names}
     held_out, apart = _cross_validated(found, views, board)
-    alone = {name: _by_itself(name, found, views, board) for name in names}
+    alone = {name: _calibrate_from_own_views(name, found, views, board) for name in names}
     seen = {key: found.scene.rig_from_view(*key) for key in views}
     distances = [np.linalg.norm((found.scene.cam_from_rig[key[0]] @ pose).translation) for key, pose in seen.items()]
     delays, readouts = _delays(found.scene, views), readout_sigmas(found)
@@ -527,7 +527,9 @@ def _describe(
             held_out_px=held_out.get(name),
             parameters_apart=apart[name][0] if name in apart else None,
             place_apart=apart[name][1] if name in apart else None,
-            alone_apart=_lens_apart(found.scene.cameras[name], alone[name]) if len(of[name]) >= _TELLING else None,
+            alone_apart=_lens_difference_in_sigmas(found.scene.cameras[name], alone[name])
+            if len(of[name]) >= _TELLING
+            else None,
             delay_frames=delays[name][0],
             delay_spread_frames=delays[name][1],
             readout=found.scene.timing.readout[name] if found.scene.timing and readouts else None,
@@ -552,7 +554,12 @@ def _describe(
         rig_from_view=seen,
         distance_mm=float(np.median(distances)),
         frames_per_s=frames_per_s,
-        notes=(*notes, *_of_board(found.scene), *_of_time(checks, frames_per_s), *_doubts(found.settled, checks, rig)),
+        notes=(
+            *notes,
+            *_board_notes(found.scene),
+            *_timing_notes(checks, frames_per_s),
+            *_doubt_notes(found.settled, checks, rig),
+        ),
     )
 
 
@@ -572,11 +579,11 @@ def _delays(scene: BoardScene, views: Views) -> dict[str, tuple[float, float] | 
     return {name: (float(np.mean(each)), float(np.std(each))) for name, each in late.items()}
 
 
-def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjusted:
+def _calibrate_from_own_views(name: str, found: Adjusted, views: Views, board: Target) -> Adjusted:
     """A camera from its own views alone, beginning from the one that was found; of several boards each for itself."""
     if len(found.scene.cameras) == 1:
         return found
-    views = at_middle_rows(found.scene, {key: view for key, view in views.items() if key[0] == name}, board)
+    views = views_at_middle_rows(found.scene, {key: view for key, view in views.items() if key[0] == name}, board)
     own, poses = dict[tuple[str, str], BoardView](), dict[str, Rigid3]()
     for camera, instant in views:
         pose = found.scene.cam_from_rig[name] @ found.scene.rig_from_view(camera, instant)
@@ -599,10 +606,10 @@ def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjus
     return adjust_board(scene, own, board, keep_scales=True)
 
 
-def _lens_apart(camera: Camera, alone: Adjusted) -> float:
+def _lens_difference_in_sigmas(camera: Camera, alone: Adjusted) -> float:
     """Difference of the parameters from those of the camera alone, in the standard deviations of these."""
     (other,) = (each.camera for each in mounted_cameras(alone).values())
-    return _in_sigmas(camera.parameters - other.parameters, require_covariance(other.covariance))
+    return _rms_in_sigmas(camera.parameters - other.parameters, require_covariance(other.covariance))
 
 
 def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
@@ -614,7 +621,7 @@ def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCame
     return replace(
         mounted,
         camera=camera,
-        covariance=_beyond_chance(check.place_apart) ** 2 * require_covariance(mounted.covariance),
+        covariance=_inflation_factor(check.place_apart) ** 2 * require_covariance(mounted.covariance),
         shutter=Shutter(
             delay_frames=check.delay_frames or 0.0,
             delay_sigma_frames=check.delay_spread_frames or 0.0,
@@ -625,15 +632,15 @@ def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCame
 
 
 def _lens_factor(check: CameraCheck) -> float:
-    return max(_beyond_chance(check.parameters_apart), _beyond_chance(check.alone_apart))
+    return max(_inflation_factor(check.parameters_apart), _inflation_factor(check.alone_apart))
 
 
-def _beyond_chance(apart: float | None) -> float:
+def _inflation_factor(apart: float | None) -> float:
     """How many standard deviations something is apart, where chance hardly explains that; else 1."""
     return apart if apart is not None and apart > _DOUBTFUL else 1.0
 
 
-def _of_board(scene: BoardScene) -> Iterator[str]:
+def _board_notes(scene: BoardScene) -> Iterator[str]:
     """Where its corners do not lie as given."""
     if scene.shape is not None:
         across, out = (1000 * sigma for sigma in scene.shape.sigma_mm)
@@ -643,7 +650,7 @@ def _of_board(scene: BoardScene) -> Iterator[str]:
         )
 
 
-def _of_time(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> Iterator[str]:
+def _timing_notes(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> Iterator[str]:
     """Where the cameras do not expose together, or not all of their rows."""
 
     def describe(name: str, frames: float, sigma: float | None, digits: int) -> str:
@@ -672,7 +679,7 @@ def _of_time(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> I
         )
 
 
-def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
+def _doubt_notes(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
     """Where the search did not end; where the lens or the board is not what the model says, or the cameras were not
     triggered together; where the views leave the focal length open."""
     if not settled:
@@ -717,7 +724,7 @@ def _cross_validated(
         return {}, {}
     try:
         parts = [
-            adjust_scene(of_instants(found.scene, {key[1] for key in half}), half, board, keep_scales=True)
+            adjust_scene(select_instants(found.scene, {key[1] for key in half}), half, board, keep_scales=True)
             for half in halves
         ]
     except ReconstructionError:  # half of the views leave open where a board, or a camera, is
@@ -725,14 +732,16 @@ def _cross_validated(
     squares: dict[str, list[Float[np.ndarray, "n 2"]]] = {name: [] for name in found.scene.cameras}
     for part, other, other_views in zip(parts, parts[::-1], halves[::-1], strict=True):
         start = replace(part.scene, rig_from_board=other.scene.rig_from_board)
-        shown = in_front(start, other_views, board) if start.timing is None else other_views
+        shown = views_in_front(start, other_views, board) if start.timing is None else other_views
         if not shown:
             continue
-        start = of_instants(start, {instant for _, instant in shown})
+        start = select_instants(start, {instant for _, instant in shown})
         for (camera, _), residuals in adjust_scene(start, shown, board, only_boards=True).residuals.items():
             squares[camera].append(residuals)
     tell = all(count[name] >= _TELLING for count in counts for name in cameras)
-    return {name: _rms(np.concatenate(each)) for name, each in squares.items() if each}, _apart(*parts) if tell else {}
+    return {name: _rms(np.concatenate(each)) for name, each in squares.items() if each}, _differences_in_sigmas(
+        *parts
+    ) if tell else {}
 
 
 def _halves(views: Views, timing: Timing | None) -> list[Views]:
@@ -744,7 +753,7 @@ def _halves(views: Views, timing: Timing | None) -> list[Views]:
     return [{key: view for key, view in views.items() if half[key[1]] == k} for k in range(2)]
 
 
-def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
+def _differences_in_sigmas(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
     """Differences of parameters and of places, in standard deviations of the difference, RMS over the numbers."""
     between = [one.scene.cam_from_rig[name] @ pose.inverse() for name, pose in other.scene.cam_from_rig.items()]
     motions = common_free(one.scene, [np.array([*m.rotation_vector, *m.translation]) for m in between])
@@ -754,8 +763,8 @@ def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
         a, b = ours[name], theirs[name]
         shift = a.camera.parameters - b.camera.parameters
         found[name] = (
-            _in_sigmas(shift, require_covariance(a.camera.covariance) + require_covariance(b.camera.covariance)),
-            _in_sigmas(motion, require_covariance(a.covariance) + require_covariance(b.covariance)),
+            _rms_in_sigmas(shift, require_covariance(a.camera.covariance) + require_covariance(b.camera.covariance)),
+            _rms_in_sigmas(motion, require_covariance(a.covariance) + require_covariance(b.covariance)),
         )
     return found
 
@@ -767,6 +776,6 @@ def require_covariance(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.
     return covariance
 
 
-def _in_sigmas(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray, "n n"]) -> float:
+def _rms_in_sigmas(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray, "n n"]) -> float:
     """RMS of a difference, each direction in its standard deviations."""
     return float(np.sqrt(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference / len(difference)))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.calibration.circle_centres import seen_grid
+from cuspid.calibration.circle_centres import recognize_grid
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.lattice import find_lattice
 from cuspid.calibration.tag_corners import ABOVE, detect_tags, layout_agreement, tag_beside
@@ -29,8 +29,8 @@ def cause_of_absence(images: Sequence[Gray], board: Target) -> str | None:
     """What makes the board be found in most of some images in which it is not as it stands, and what to change; None
     where nothing does."""
     if isinstance(board, BoardSet):
-        told = [(number, _verify_board(images, each)) for number, each in enumerate(board.boards, 1)]
-        alone = next((f"board {number}: {cause}" for number, cause in told if cause is not None), None)
+        causes = [(number, _verify_board(images, each)) for number, each in enumerate(board.boards, 1)]
+        alone = next((f"board {number}: {cause}" for number, cause in causes if cause is not None), None)
         return _other_ids(images, board) or alone
     return _verify_board(images, board) or _other_ids(images, board) or _other_markers(images, board)
 
@@ -76,7 +76,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
     if board.has_circles or board.kind == "aprilgrid":
         yield from _other_grids(board, images)
         return
-    for columns, rows, why in (*_seen_sizes(board, images), *_sizes(board)):
+    for columns, rows, why in (*_visible_sizes(board, images), *_sizes(board)):
         sized = _possible(board, columns=columns, rows=rows)
         if sized is not None:
             yield f"{why}: give --columns {columns} --rows {rows}", sized, False
@@ -92,7 +92,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
     yield from _other_grids(board, images)
 
 
-def _seen_sizes(board: Board, images: Sequence[Gray]) -> Iterator[tuple[int, int, str]]:
+def _visible_sizes(board: Board, images: Sequence[Gray]) -> Iterator[tuple[int, int, str]]:
     """Numbers of squares of the chessboard that most images show, whatever it is said to be."""
     if board.kind != "chessboard":
         return
@@ -134,7 +134,7 @@ def _other_first_ids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str
     others = [_possible(board, first_id=first) for first in range(ids[0], max(ids[-1] - board.markers, -1), -1)]
     able = [each for each in others if each is not None]
     if board.kind == "aprilgrid":
-        seen = [detect_tags(_as_printed(image, board), board.border_bits) for image in images]
+        seen = [detect_tags(_undo_inversion(image, board), board.border_bits) for image in images]
         able.sort(key=lambda each: -sum(layout_agreement(outlines, each.tags) for outlines in seen))
     if able and able[0] != board:
         first = able[0].first_id
@@ -146,17 +146,17 @@ def _ids_seen(images: Sequence[Gray], board: Board) -> list[int]:
     """The ids of the markers of a board's family in some images, in order, but for those that are seen too seldom to be
     trusted; none where they are few."""
     if board.kind == "aprilgrid":
-        found = [list(detect_tags(_as_printed(image, board), board.border_bits)) for image in images]
+        found = [list(detect_tags(_undo_inversion(image, board), board.border_bits)) for image in images]
     else:
         detector = cv2.aruco.ArucoDetector(_dictionary(board.family))
-        seen = [detector.detectMarkers(_as_printed(image, board))[1] for image in images]
+        seen = [detector.detectMarkers(_undo_inversion(image, board))[1] for image in images]
         found = [each.ravel().tolist() for each in seen if each is not None]
     counts = Counter(each for ids in found for each in ids)
     ids = sorted(each for each, count in counts.items() if count >= min(2, len(images)))
     return ids if len(ids) >= _FEWEST_MARKERS else []
 
 
-def _as_printed(image: Gray, board: Board) -> Gray:
+def _undo_inversion(image: Gray, board: Board) -> Gray:
     return 255 - image if board.inverted else image
 
 
@@ -166,15 +166,15 @@ def _dictionary(family: str) -> cv2.aruco.Dictionary:
 
 def _other_ids(images: Sequence[Gray], target: Target) -> str | None:
     """Where images show markers with ids that are none of a board's, or of several: which, and which it has."""
-    told = []
+    advice = []
     for family, board in {board.family: board for board in target.boards if board.has_markers}.items():
         own = {each for one in target.boards if one.family == family for each in one.ids}
         strange = [each for each in _ids_seen(images, board) if each not in own]
         if len(strange) >= _FEWEST_MARKERS:
             has = " and ".join(one.ids_told for one in target.boards if one.family == family)
             what = "these boards have" if len(target.boards) > 1 else "this board has"
-            told.append(f"markers of the family {family} with the ids {strange[0]}-{strange[-1]} found, {what} {has}")
-    return "; ".join(told) or None
+            advice.append(f"markers of the family {family} with the ids {strange[0]}-{strange[-1]} found, {what} {has}")
+    return "; ".join(advice) or None
 
 
 def _other_markers(images: Sequence[Gray], board: Board) -> str | None:
@@ -202,7 +202,7 @@ def _other_tags(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Boa
     pitch, steps = 1 + board.spacing_share, list[int]()
     ids = set[int]()
     for image in images:
-        outlines = detect_tags(_as_printed(image, board), board.border_bits)
+        outlines = detect_tags(_undo_inversion(image, board), board.border_bits)
         above = {tag: tag_beside(outlines, tag, ABOVE, pitch) for tag in outlines}
         steps += [other - tag for tag, other in above.items() if other is not None]
         ids |= set(outlines)
@@ -217,8 +217,8 @@ def _other_tags(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Boa
 
 def _other_grids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, bool]]:
     """The grid of circles, or the chessboard, that most images show."""
-    shown = [_as_printed(image, board) for image in images]
-    grids = Counter(each for each in map(seen_grid, shown) if each is not None)
+    shown = [_undo_inversion(image, board) for image in images]
+    grids = Counter(each for each in map(recognize_grid, shown) if each is not None)
     squares = Counter(each.size for each in map(find_lattice, images) if each is not None)
     for (kind, columns, rows), count in grids.most_common(1):
         other = _possible(board, kind=kind, columns=columns, rows=rows)

@@ -181,20 +181,20 @@ def _with_view(camera: CameraCoverage, view: BoardView, board: Target) -> Camera
 
 
 def _missing_of(camera: CameraCoverage, options: CoverageOptions) -> list[str]:
-    said = []
+    lacks = []
     if camera.views < options.views:
-        said.append(f"{options.views - camera.views} views")
-    said += [f"corners {place}" for place in _places(camera.cells < options.views_of_cell)]
+        lacks.append(f"{options.views - camera.views} views")
+    lacks += [f"corners {place}" for place in _places(camera.cells < options.views_of_cell)]
     focal_px = focal_px_of(camera.homographies, camera.size[0])
     poses = [tilt_of(each, focal_px) for each in camera.homographies]
     sides = [side for tilt_deg, side, _ in poses if options.min_tilt_deg <= tilt_deg <= _MOST_TILT_DEG]
     tilts = [side for side in SIDES if sides.count(side) < options.views_of_tilt]
     if tilts:
-        said.append(f"tilts with the {' / '.join(tilts)} nearer")
+        lacks.append(f"tilts with the {' / '.join(tilts)} nearer")
     distances = [distance for _, _, distance in poses]
     if distances and max(distances) < options.distance_ratio * min(distances):
-        said.append("another distance")
-    return said
+        lacks.append("another distance")
+    return lacks
 
 
 def _places(lacking: np.ndarray) -> Sequence[str]:

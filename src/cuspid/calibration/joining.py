@@ -18,7 +18,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.calibration.agreement import agreed_on
+from cuspid.calibration.agreement import consensus_motion
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.corners import BoardView, Views, split_by_board
 from cuspid.calibration.start import board_pose
@@ -71,7 +71,7 @@ class _Groups:
         """Numbers of the boards of a group, from 0."""
         return [number for number, (own, _) in self.board.items() if own == group]
 
-    def joined_cameras(self, first: int, second: int, first_from_second: Rigid3) -> _Groups:
+    def merge_cameras(self, first: int, second: int, first_from_second: Rigid3) -> _Groups:
         """With two groups of cameras as one."""
         moved = {
             name: (first, first_from_second @ place) if group == second else (group, place)
@@ -79,7 +79,7 @@ class _Groups:
         }
         return replace(self, camera=moved)
 
-    def joined_boards(self, first: int, second: int, first_from_second: Rigid3) -> _Groups:
+    def merge_boards(self, first: int, second: int, first_from_second: Rigid3) -> _Groups:
         """With two groups of boards as one."""
         moved = {
             number: (first, first_from_second @ place) if group == second else (group, place)
@@ -88,7 +88,7 @@ class _Groups:
         return replace(self, board=moved)
 
 
-def joined_boards(
+def join_boards(
     views: Views, target: BoardSet, cameras: Mapping[str, Camera]
 ) -> tuple[BoardScene, dict[tuple[str, str], BoardView], tuple[str, ...]]:
     """The cameras in the frame of the first one, the boards on their body, and that body at each instant; the views of
@@ -96,7 +96,7 @@ def joined_boards(
 
     Raises ReconstructionError where cameras cannot be joined, or boards or cameras moved against each other.
     """
-    seen = list(_all_seen(views, target, cameras))
+    seen = list(_estimate_board_poses(views, target, cameras))
     boards = sorted({each.board for each in seen})
     groups = _Groups(
         camera={name: (k, Rigid3.identity()) for k, name in enumerate(cameras)},
@@ -126,7 +126,7 @@ def joined_boards(
     return scene, {key: view for key, view in views.items() if key in kept}, groups.notes
 
 
-def _all_seen(views: Views, target: BoardSet, cameras: Mapping[str, Camera]) -> Collection[_Seen]:
+def _estimate_board_poses(views: Views, target: BoardSet, cameras: Mapping[str, Camera]) -> Collection[_Seen]:
     found = []
     for (camera, instant), view in views.items():
         for part in split_by_board(view, target):
@@ -149,15 +149,15 @@ def _join_two_groups(groups: _Groups, seen: Sequence[_Seen]) -> _Groups | None:
             if count:
                 shared.append((count, kind, one, other))
     if not shared:
-        return _joined_by_motion(groups, poses)
+        return _join_by_motion(groups, poses)
     _, kind, one, other = max(shared, key=lambda each: each[0])
     side = 0 if kind == "cameras" else 1
-    said = _estimate_hand_eye(poses, one, other, side)
+    candidates = _estimate_hand_eye(poses, one, other, side)
     away = [pose.translation for each in poses.values() for pose in each.values()]
-    best, agreeing = agreed_on([[each] for each in said], float(np.median(np.linalg.norm(away, axis=1))))
-    if 2 * agreeing < len(said):
-        raise ReconstructionError(_disagreement(groups, kind, one, other, agreeing, len(said)))
-    return groups.joined_cameras(one, other, best) if side == 0 else groups.joined_boards(one, other, best)
+    best, agreeing = consensus_motion([[each] for each in candidates], float(np.median(np.linalg.norm(away, axis=1))))
+    if 2 * agreeing < len(candidates):
+        raise ReconstructionError(_disagreement(groups, kind, one, other, agreeing, len(candidates)))
+    return groups.merge_cameras(one, other, best) if side == 0 else groups.merge_boards(one, other, best)
 
 
 def _estimate_hand_eye(
@@ -165,13 +165,15 @@ def _estimate_hand_eye(
 ) -> list[Rigid3]:
     """``one_from_other`` of two groups of cameras (``side`` 0) or of boards (1), as each instant says at which both
     saw, or were seen by, the same group."""
-    said = []
+    candidates = []
     for key, first in poses.items():
         second = poses.get((other, key[1]) if side == 0 else (key[0], other), {})
         if key[side] == one:
             both = sorted(set(first) & set(second))
-            said += [first[i] @ second[i].inverse() if side == 0 else first[i].inverse() @ second[i] for i in both]
-    return said
+            candidates += [
+                first[i] @ second[i].inverse() if side == 0 else first[i].inverse() @ second[i] for i in both
+            ]
+    return candidates
 
 
 def _disagreement(groups: _Groups, kind: str, one: int, other: int, agreeing: int, count: int) -> str:
@@ -195,7 +197,7 @@ def _numbers(boards: Sequence[int]) -> str:
 # --- by motion ---------------------------------------------------------------------------------------------------
 
 
-def _joined_by_motion(groups: _Groups, poses: Mapping[tuple[int, int], Mapping[str, Rigid3]]) -> _Groups | None:
+def _join_by_motion(groups: _Groups, poses: Mapping[tuple[int, int], Mapping[str, Rigid3]]) -> _Groups | None:
     """Two groups of cameras, and the boards that they saw, joined by how both moved; None where no two moved together.
 
     Raises ReconstructionError where they turned too little.
@@ -224,7 +226,7 @@ def _joined_by_motion(groups: _Groups, poses: Mapping[tuple[int, int], Mapping[s
         f"{len(instants)} instants ({turn_deg:.0f} degrees about the second axis, RMS); the boards must not have moved "
         "against each other"
     )
-    grown = groups.joined_cameras(one[0], other[0], cameras).joined_boards(one[1], other[1], boards)
+    grown = groups.merge_cameras(one[0], other[0], cameras).merge_boards(one[1], other[1], boards)
     return replace(grown, notes=(*groups.notes, note))
 
 

@@ -17,7 +17,7 @@ from cuspid.storage.calibrations import (
     MOST_LOST_PX,
     Loss,
     Name,
-    carried_over,
+    fit_to_format,
     format_of_name,
     read_calibration,
     write_calibration,
@@ -55,12 +55,12 @@ def convert(
         raise InputError(f"convert: {target}: is the file that is read; give another name for the result")
     read = read_calibration(source, kind=from_, unit=unit, image_size_px=image_size)
     _tell(source, read.losses, read.notes, max_px)
-    carried = carried_over(read.rig, kind)
+    carried = fit_to_format(read.rig, kind)
     _tell(target, carried.losses, carried.notes, max_px)
     write_calibration(target, carried.rig, kind, working_distance_mm)
     names = list(read.rig.names)
-    said = f"{target}: {kind}, {len(names)} camera(s) ({join_names(names)}), from {read.format}"
-    console.print(said, soft_wrap=True, highlight=False)
+    summary = f"{target}: {kind}, {len(names)} camera(s) ({join_names(names)}), from {read.format}"
+    console.print(summary, soft_wrap=True, highlight=False)
 
 
 def _tell(path: Path, losses: Mapping[str, Loss], notes: tuple[str, ...], max_px: float) -> None:

@@ -135,11 +135,11 @@ def _watch_folder(folder: Path, handpiece: Path | None, distance_mm: float | Non
         assert arrivals.source is not None  # a frame has come
         return arrivals.source
 
-    frames = _arriving(arrivals, options)
+    frames = _await_frames(arrivals, options)
     return _Feed(handpiece=known, source=source, frames=frames, left_out=lambda: arrivals.left_out)
 
 
-def _arriving(arrivals: Arrivals, options: FollowOptions) -> Iterator[Frame | None]:
+def _await_frames(arrivals: Arrivals, options: FollowOptions) -> Iterator[Frame | None]:
     """Frames as they come; ends when none has come for long."""
     latest, paused = time.monotonic(), False
     while time.monotonic() - latest < options.end_s:

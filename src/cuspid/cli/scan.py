@@ -114,8 +114,7 @@ def reconstruct(
         from_poses: Folder of a COLMAP model whose poses are used instead of finding them.
     """
     if storage.is_photographs(capture, handpiece):
-        given = reconstruction, photographs, scale, from_poses
-        reconstruct_photographs(capture, out, handpiece, *given)
+        reconstruct_photographs(capture, out, handpiece, reconstruction, photographs, scale, from_poses)
         return
     if scale != PhotoScaleOptions():
         raise InputError("--square-mm and --distance are for photographs of one camera; a handpiece knows the scale")
@@ -239,7 +238,7 @@ def _evaluate_trajectory(mesh: Path, truth: Path, trueness: Trueness, out: Path)
     found, true = mesh.parent / "motion" / "poses.json", truth / "poses.json"
     if mesh.stem != "mesh" or not (found.is_file() and true.is_file()):
         return
-    poses = _as_of(storage.read_poses(found), found.parent, truth)
+    poses = _in_true_frame(storage.read_poses(found), found.parent, truth)
     try:
         error = trajectory_error(poses, storage.read_poses(true), trueness.reference_from_scan)
     except InputError as reason:
@@ -253,7 +252,7 @@ def _evaluate_trajectory(mesh: Path, truth: Path, trueness: Trueness, out: Path)
     )
 
 
-def _as_of(rig_from_world: Mapping[str, Rigid3], motion: Path, truth: Path) -> dict[str, Rigid3]:
+def _in_true_frame(rig_from_world: Mapping[str, Rigid3], motion: Path, truth: Path) -> dict[str, Rigid3]:
     """Poses of the frame in which the true handpiece is described: where a calibration has its own, no image tells."""
     files = [folder / "handpiece.json" for folder in (motion, truth)]
     if not all(file.is_file() for file in files):

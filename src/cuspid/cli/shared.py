@@ -155,10 +155,12 @@ def print_expected(found: Reconstruction, sigma_um: Float[np.ndarray, "v"]) -> N
         return
     middle, most = np.percentile(sigma_um, [50, 95])
     if expected.is_exact:
-        told = "the calibration, which states no uncertainty, and the poses are taken as exact"
+        assumptions = "the calibration, which states no uncertainty, and the poses are taken as exact"
     else:
-        told = (
+        assumptions = (
             f"by {found.told_by}, scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm "
             f"from end to end within {expected.span_sigma_um:.1f} µm"
         )
-    console.print(f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); {told}")
+    console.print(
+        f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); {assumptions}"
+    )

@@ -119,12 +119,12 @@ def fit_deformation(places: Places, curve: ArchCurve, scan: SignedDistance) -> D
     amplitudes = 1e3 * solution[6:]
     normal_rigid = np.einsum("nmk,nk->nm", rigid, used.normals)
     alone = {
-        name: amplitude * _without(normal_rigid, np.sum(1e3 * fields[name] * used.normals, axis=1))
+        name: amplitude * _residual(normal_rigid, np.sum(1e3 * fields[name] * used.normals, axis=1))
         for name, amplitude in zip(MODES, amplitudes, strict=True)
     }
     return Deformation(
         amplitudes=dict(zip(MODES, map(float, amplitudes), strict=True)),
-        rms_um={name: _rms(each) for name, each in alone.items()},
+        rms_um={name: float(np.sqrt(np.mean(each**2))) for name, each in alone.items()},
         before_um=before,
         remainder_um=left,
     )
@@ -157,13 +157,9 @@ def _rigid_fields(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6 3"
     return np.stack([*turns, *(np.broadcast_to(axis, points.shape) for axis in np.eye(3))], axis=1)
 
 
-def _without(columns: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _residual(columns: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """What the columns cannot explain of values."""
     return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
-
-
-def _rms(values: Float[np.ndarray, "n"]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _integral(

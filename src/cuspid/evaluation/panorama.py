@@ -552,13 +552,13 @@ class _Comparison:
             tooth_coverage_pct=teeth,
             complete=self.panorama.parts == 1 and min(teeth.values()) >= self.options.complete_pct,
             picture=image_scores(grey(laid), shown, grey(self.view.image), self.view.teeth, self.seen),
-            shot=self._against_shot(shot_from_panorama),
+            shot=self._compare_with_shot(shot_from_panorama),
             **figures,
         )
         nowhere = np.zeros((0, 2)), np.zeros(0)
         return PanoramaComparison(score=score, aligned=laid, points_mm=nowhere[0], errors_mm=nowhere[1])
 
-    def _against_shot(self, shot_from_panorama: Similarity2 | None) -> ImageScores | None:
+    def _compare_with_shot(self, shot_from_panorama: Similarity2 | None) -> ImageScores | None:
         if self.shot is None or shot_from_panorama is None:
             return None
         laid, shown = lay_over(self.panorama, self.shot, shot_from_panorama)

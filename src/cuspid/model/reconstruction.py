@@ -152,14 +152,14 @@ class Tracks:
     """For each observation: the place, in px of the (distorted) image."""
 
 
-def joined_tracks(first: Tracks, second: Tracks) -> Tracks:
+def concatenate_tracks(first: Tracks, second: Tracks) -> Tracks:
     """The points and observations of both."""
     joined = {each.name: np.concatenate([getattr(t, each.name) for t in (first, second)]) for each in fields(Tracks)}
     joined["point_index"][len(first.point_index) :] += len(first.points)
     return Tracks(**joined)
 
 
-def chosen_tracks(tracks: Tracks, which: Bool[np.ndarray, "o"]) -> Tracks:
+def select_tracks(tracks: Tracks, which: Bool[np.ndarray, "o"]) -> Tracks:
     """Some of the observations, and the points that are seen in them."""
     kept, number = np.unique(tracks.point_index[which], return_inverse=True)
     return Tracks(

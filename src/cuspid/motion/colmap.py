@@ -46,7 +46,7 @@ SCALE_SPREAD = 0.02
 def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
     """The same camera as COLMAP's, which has the same models, parameters and pixel origin; with the nearest of its
     lenses for a splined one, which it lacks."""
-    camera = _with_its_lens(camera)
+    camera = _convert_splined_lens(camera)
     return pycolmap.Camera(
         camera_id=camera_id,
         model=camera.model,
@@ -57,7 +57,7 @@ def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
 
 
 @lru_cache(maxsize=64)
-def _with_its_lens(camera: Camera) -> Camera:
+def _convert_splined_lens(camera: Camera) -> Camera:
     return convert_lens(camera, ALL)[0] if camera.lens.splined else camera
 
 

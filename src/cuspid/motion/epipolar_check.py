@@ -18,7 +18,7 @@ from cuspid.model.capture import Capture
 from cuspid.model.epipolar import epipolar_residuals, skew
 from cuspid.model.pairing import stereo_pairs
 from cuspid.motion.frontend.features import detect_all
-from cuspid.motion.frontend.odometry import searched_mm
+from cuspid.motion.frontend.odometry import search_range_mm
 from cuspid.motion.frontend.pairs import IndexedFeatures, match_guided
 from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.location import MotionOptions, index_frame
@@ -43,7 +43,7 @@ def epipolar_offset_px(
         for first, second in (pair for pair in pairs if all(name in views for name in pair)):
             a, b = views[first], views[second]
             b_from_a = handpiece.rig[second].cam_from_rig @ handpiece.rig[first].cam_from_rig.inverse()
-            bounds = searched_mm(handpiece, a), searched_mm(handpiece, b)
+            bounds = search_range_mm(handpiece, a), search_range_mm(handpiece, b)
             matches = match_guided(a, b, b_from_a, *bounds, within)
             if len(matches) < _LEAST_MATCHES:
                 continue

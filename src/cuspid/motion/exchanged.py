@@ -118,7 +118,7 @@ def check_features(
 ) -> CameraCheck:
     """As :func:`check_cameras`, from the keypoints by (frame, camera) of consecutive frames."""
     names = handpiece.rig.names
-    few = {key: _some(each) for key, each in features.items()}
+    few = {key: _sample_features(each) for key, each in features.items()}
     motion, own = _Motion(handpiece, few, frames, options), np.arange(len(names))
     beside = [(names.index(a), names.index(b)) for a, b in _pairs(handpiece, options)]
     matches = _Matches.of(handpiece, few, frames, options, beside)
@@ -137,7 +137,7 @@ def check_features(
     before, gained = (int(each[moved].sum()) for each in (agreeing, after))
     ties = _ties(after, matches.counts)[moved]
     tied = ties.any(axis=1).all() and (after[moved][ties].sum() >= _NAMED_SHARE * matches.counts[moved][ties].sum())
-    if len(moved) and tied and (gained >= _GAIN * before or motion.is_told_by(slots, own)):
+    if len(moved) and tied and (gained >= _GAIN * before or motion.is_preferred(slots, own)):
         taken_by = {names[k]: names[slots[k]] for k in moved}
         return CameraCheck(taken_by=taken_by, agreeing=gained, before=before, contradicted=())
     return nothing
@@ -147,7 +147,7 @@ def _pairs(handpiece: Handpiece, options: MotionOptions) -> tuple[tuple[str, str
     return stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
 
 
-def _some(features: Features) -> Features:
+def _sample_features(features: Features) -> Features:
     chosen = np.unique(np.linspace(0, len(features) - 1, _KEYPOINTS).astype(int)) if len(features) else slice(0)
     return Features(
         pixels=features.pixels[chosen], descriptors=features.descriptors[chosen], colors=features.colors[chosen]
@@ -240,9 +240,9 @@ def _fits(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> B
 
 def _contradicted_cameras(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c"]:
     """Cameras of which hardly a match with those beside them agrees, while those of others do."""
-    told = counts >= _TOLD
-    lost = told.any(axis=1) & ~(told & (agreeing >= _LOST_SHARE * counts)).any(axis=1)
-    return np.asarray(lost & (told & (agreeing >= _SHARE * counts)).any())
+    sufficient = counts >= _TOLD
+    lost = sufficient.any(axis=1) & ~(sufficient & (agreeing >= _LOST_SHARE * counts)).any(axis=1)
+    return np.asarray(lost & (sufficient & (agreeing >= _SHARE * counts)).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +255,7 @@ class _Motion:
     options: MotionOptions
 
     @computed_once
-    def tells(self) -> bool:
+    def is_decidable(self) -> bool:
         """Whether there is something to agree on."""
         groups = camera_groups(self.handpiece.rig, self.handpiece.working_distance_mm, self.options.pairing)
         return len(groups) > 1 and len(self.frames) > 1
@@ -263,18 +263,18 @@ class _Motion:
     def is_one(self, slots: Slots) -> bool:
         """Whether nearly all that was matched moved as one."""
         edges = self._edges(slots)
-        return not self.tells or sum(e.matches for e in edges) >= _MOVED_SHARE * sum(e.sought for e in edges)
+        return not self.is_decidable or sum(e.matches for e in edges) >= _MOVED_SHARE * sum(e.sought for e in edges)
 
     def agreeing(self, slots: Slots) -> int:
         """Matches to the next frames that agree on one motion."""
         return sum(edge.matches for edge in self._edges(slots))
 
-    def is_told_by(self, slots: Slots, others: Slots) -> bool:
+    def is_preferred(self, slots: Slots, others: Slots) -> bool:
         """Whether far more moved as one than with other slots."""
-        return self.tells and self.agreeing(slots) >= max(_GAIN * self.agreeing(others), _LEAST)
+        return self.is_decidable and self.agreeing(slots) >= max(_GAIN * self.agreeing(others), _LEAST)
 
     def _edges(self, slots: Slots) -> list[Edge]:
-        if not self.tells:
+        if not self.is_decidable:
             return []
         names, rig = self.handpiece.rig.names, self.handpiece.rig
         camera = {name: names[k] for name, k in zip(names, slots, strict=True)}

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from cuspid.geometry import unit
-from cuspid.geometry.gloss import coat, leaving
+from cuspid.geometry.gloss import coat, transmittance
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Light
 from cuspid.runtime.kernels import kernel
@@ -73,7 +73,7 @@ def estimate_glare(
         known = np.isfinite(normals).all(axis=-1)
         points = rays[known] / inverse[known, None]
         spot[known] = mirror_reflections(points, normals[known], lights)
-        share[known] = _leaving(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
+        share[known] = _transmittances(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
     past_pits, spot = spots
     return Glare(spot, STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
 
@@ -126,8 +126,8 @@ def _gloss(falling, facing, halfway, grazing):
 
 @kernel(fastmath=True)
 @no_type_check
-def _leaving(facing, index):
+def _transmittances(facing, index):
     out = np.empty_like(facing)
     for i in range(len(out)):
-        out[i] = leaving(max(facing[i], _OBLIQUE), index)
+        out[i] = transmittance(max(facing[i], _OBLIQUE), index)
     return out

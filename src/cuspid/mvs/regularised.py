@@ -63,7 +63,7 @@ def sweep(
     chosen = semi_global(1 - zncc, _SMALL, _LARGE)
     at = np.take_along_axis(zncc, np.rint(chosen).astype(np.int64)[..., None], axis=2)[..., 0]
     q = np.where(at >= _LEAST_ZNCC, np.clip(low + step * chosen, low, high), np.nan)
-    return _on_grid(q, np.linalg.inv(to_full), (height, width), spacing_px), SIGMA_PX / scale
+    return _sample_grid(q, np.linalg.inv(to_full), (height, width), spacing_px), SIGMA_PX / scale
 
 
 def _column(parallax: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -117,7 +117,7 @@ def _zncc(
     return np.where(_blur(shown) > 0.99, zncc, 0).astype(np.float32)
 
 
-def _on_grid(
+def _sample_grid(
     values: Float[np.ndarray, "h w"], from_full: Float[np.ndarray, "3 3"], size: tuple[int, int], spacing_px: int
 ) -> Float[np.ndarray, "rows columns"]:
     """The nearest value at every ``spacing_px``-th pixel of the whole image."""

@@ -269,10 +269,6 @@ def _sweep(
     return np.asarray(planes[0] + label * options.sweep_step_px)
 
 
-def _every(count: int, spacing: int) -> Int[np.ndarray, "n"]:
-    return np.arange(spacing // 2, count, spacing)
-
-
 @kernel
 @no_type_check
 def _upsample_planes(coarse, spacing, rows, columns, fine):
@@ -450,11 +446,10 @@ def shaded_depths(
     ``images`` are those of :func:`brightness`.
     """
     blurred = np.stack([_masked_blur(image, options.blur_px) for image in images])
-    compared_of = _ratios if _are_coloured(views[0].lights) else _as_they_are
+    compared_of = _ratios if _are_coloured(views[0].lights) else _intensities
     compared, trust = compared_of(blurred, np.ones_like(blurred))
-    how = depth_range_mm, spacing_px, options
     refinements = [
-        _Refinement(compared, hue, index, view, *how)
+        _Refinement(compared, hue, index, view, depth_range_mm, spacing_px, options)
         for index, (view, hue) in enumerate(zip(views, _hues(blurred), strict=True))
     ]
     found = [each.refine(compared, trust, _LENIENT) for each in refinements]
@@ -501,7 +496,7 @@ def _are_coloured(lights: Sequence[Light]) -> bool:
     return any(np.abs(unit(one.colour) - unit(lights[0].colour)).max() > _COLOURED for one in lights)
 
 
-def _as_they_are(images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"]) -> _Compared:
+def _intensities(images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"]) -> _Compared:
     return images, trust
 
 
@@ -549,7 +544,7 @@ class _Refinement:
         geometry = self._geometry = view.geometry
         self._spacing_px, self._bend_px = spacing_px, options.bend_px
         self._view = _View(images, images, reference, geometry.infinite, geometry.parallax, geometry.others)
-        self._rows, self._columns = (_every(count, spacing_px) for count in view.size)
+        self._rows, self._columns = (np.arange(spacing_px // 2, count, spacing_px) for count in view.size)
         self._colours = colours[np.ix_(self._rows, self._columns)]
         lowest, highest = (view.geometry.scale / depth for depth in reversed(depth_range_mm))
         self._fit = _fit(options, lowest, highest)

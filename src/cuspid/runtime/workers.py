@@ -111,7 +111,7 @@ def map_batches(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Ite
         yield map_in_threads(work, batch)
 
 
-def in_shares(work: Callable[[int, int], None]) -> None:
+def run_in_shares(work: Callable[[int, int], None]) -> None:
     """``work(share, shares)``, which must release the GIL, for each of as many shares as there are usable cores, in
     threads."""
     shares = usable_cores()

@@ -51,7 +51,7 @@ class Material:
     applied: bool = False
     """Whether the texture is sprayed or painted on, as fine as the cameras need it, rather than the surface's own."""
 
-    def seen_by(self, footprint_mm: float) -> Material:
+    def at_footprint(self, footprint_mm: float) -> Material:
         """With an applied texture that suits cameras whose pixels have this footprint: the one for 12 um, unless its
         finest octave has less than 1 px or more than 25 px there; then it is coarser or finer by whole octaves."""
         octaves = np.log2(footprint_mm / _SUITED_MM)
@@ -72,9 +72,9 @@ class Appearance:
     marked: bool = False
     """Whether teeth and gum bear what real ones do (:func:`cuspid.simulation.marks.natural_marks`)."""
 
-    def seen_by(self, footprint_mm: float) -> Appearance:
-        """Both materials as :meth:`Material.seen_by`."""
-        return replace(self, enamel=self.enamel.seen_by(footprint_mm), gum=self.gum.seen_by(footprint_mm))
+    def at_footprint(self, footprint_mm: float) -> Appearance:
+        """Both materials as :meth:`Material.at_footprint`."""
+        return replace(self, enamel=self.enamel.at_footprint(footprint_mm), gum=self.gum.at_footprint(footprint_mm))
 
 
 _SUITED_MM, _ALIKE_OCTAVES = 0.012, 2.3

@@ -29,7 +29,7 @@ from skimage.morphology import remove_small_holes, remove_small_objects
 from skimage.restoration import inpaint_biharmonic
 
 from cuspid.geometry import Rigid3
-from cuspid.geometry.gloss import leaving
+from cuspid.geometry.gloss import transmittance
 from cuspid.geometry.semi_global import semi_global
 from cuspid.model.camera import Camera, undistortion_maps
 from cuspid.model.sparse_model import SparseModel
@@ -236,7 +236,7 @@ class _Projected(NamedTuple):
             high,
             (in_camera @ camera.opencv_matrix.T).astype(np.float32),
             (camera.opencv_matrix @ pose.rotation[:, 2]).astype(np.float32),
-            _made_up_for(facing, exit_index, gamma),
+            _limb_darkening_gain(facing, exit_index, gamma),
         )
 
     def lay(self, image: UInt8[np.ndarray, "h w 3"], higher_mm: float, window: int) -> _Laid:
@@ -253,11 +253,11 @@ _Image = tuple[UInt8[np.ndarray, "h w 3"], _Projected | None]
 
 @kernel(fastmath=True)
 @no_type_check
-def _made_up_for(facing, index, gamma):
+def _limb_darkening_gain(facing, index, gamma):
     """By what grey levels are to be multiplied where a body is seen at an angle of this cosine to its normal."""
     out = np.empty(facing.shape, np.float32)
     for place in np.ndindex(facing.shape):
-        out[place] = leaving(max(facing[place], _OBLIQUE), index) ** (-1 / gamma)
+        out[place] = transmittance(max(facing[place], _OBLIQUE), index) ** (-1 / gamma)
     return out
 
 
@@ -399,7 +399,7 @@ def plane_sweep(
     grid = Grid.from_motion(motion, max(options.cell_mm, pixel_mm)) if start is None else Grid.of(start[0])
     ceiling = sparse.interpolate(grid.pooled.centres) + _ABOVE_MM
     step_mm = max(options.step_mm, finest_mm)
-    sweep = partial(_swept, compared, _Pictures(compared, read, options.detail_px), ceiling, options)
+    sweep = partial(_sweep_part, compared, _Pictures(compared, read, options.detail_px), ceiling, options)
     finer = [max(step_mm / parts, finest_mm) * np.arange(-copies, copies + 1) for parts, copies in _FINER]
     if start is None:
         levels = np.arange(-options.depth_mm, float(sparse.heights.max()) + _ABOVE_MM + step_mm, step_mm)
@@ -421,7 +421,7 @@ def _part(progress: Progress, number: int, rounds: int) -> Progress:
     return lambda stage, done, total: progress(stage, number * total + done, rounds * total)
 
 
-def _swept(
+def _sweep_part(
     compared: Compared,
     pictures: _Pictures,
     ceiling: Float[np.ndarray, "r c"],

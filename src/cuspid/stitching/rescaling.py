@@ -63,7 +63,10 @@ def rescale_panorama(panorama: Panorama, distances: Sequence[MeasuredDistance]) 
         panorama,
         mm_per_px=factor * (panorama.mm_per_px or 1.0),
         height_mm=height,
-        notes=(*_notes(panorama, factor, measured, fitted), *(note for note in panorama.notes if not _on_scale(note))),
+        notes=(
+            *_notes(panorama, factor, measured, fitted),
+            *(note for note in panorama.notes if not note.startswith("the scale ")),
+        ),
     )
     return Rescaled(panorama=new, factor=factor, lengths_mm=fitted)
 
@@ -102,13 +105,13 @@ def _notes(
     panorama: Panorama, factor: float, measured: Float[np.ndarray, "n"], fitted: Float[np.ndarray, "n"]
 ) -> tuple[str, ...]:
     """What the scale is from, how well it can be known, and what does not fit."""
-    told = " and ".join(f"{each:g} mm" for each in measured)
+    lengths = " and ".join(f"{each:g} mm" for each in measured)
     before = "none" if panorama.mm_per_px is None else f"smaller by a factor of {factor:.4f}"
     if panorama.mm_per_px is not None and factor < 1:
         before = f"larger by a factor of {1 / factor:.4f}"
     reading_pct = 100 * _READING_MM / float(np.linalg.norm(fitted))
     known = f"an error of {_READING_MM:g} mm in them is {reading_pct:.2g} % of all lengths"
-    scale = f"the scale is that of {told} between places of the picture (before: {before}); {known}"
+    scale = f"the scale is that of {lengths} between places of the picture (before: {before}); {known}"
     off_pct = 100 * (fitted / measured - 1)
     apart = tuple(
         f"{mm:g} mm come out as {length:.2f} ({off:+.1f} %): look whether the places and the number are right, or how "
@@ -118,8 +121,3 @@ def _notes(
     )
     flat = () if panorama.height_mm is not None else ("the panorama has no heights: distances count as level",)
     return (scale, *apart, *flat)
-
-
-def _on_scale(note: str) -> bool:
-    """Whether a note tells what the scale was from."""
-    return note.startswith("the scale ")

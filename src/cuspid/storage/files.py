@@ -296,7 +296,7 @@ def claimed_folder(
     results that are to be replaced stay those of the run that made them until the work is done."""
     existed = folder.exists()
     empty = not folder.is_dir() or not any(folder.iterdir())
-    with _alone_in(folder):
+    with _lock_folder(folder):
         try:
             entry = claim_folder(folder, stage, settings, inputs, replace=replace)
             yield
@@ -316,7 +316,7 @@ _holding = threading.Lock()
 
 
 @contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
+def _lock_folder(folder: Path) -> Iterator[None]:
     """No other process works in a folder in the block, which is made if need be. Raises OutputError where one does.
 
     The folder itself is locked (flock), so that no file is left, and the lock of a process that ends ends with it;

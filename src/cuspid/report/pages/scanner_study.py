@@ -149,11 +149,11 @@ def _estimate(found: Mapping[str, Any] | None, digits: int = 1, *, plus: bool = 
     if found is None:
         return "–"
     digits += bool(digits) and abs(found["value"]) < _SMALL
-    told = (signed_number if plus else number)(found["value"], digits)
+    text = (signed_number if plus else number)(found["value"], digits)
     if found["low"] is None:
-        return told
+        return text
     show = signed_number if plus else number
-    return f"{told} ({show(found['low'], digits)} to {show(found['high'], digits)})"
+    return f"{text} ({show(found['low'], digits)} to {show(found['high'], digits)})"
 
 
 def _size(value: float | None) -> str:

@@ -129,8 +129,8 @@ def read_calibration(
     with reading(path):
         name = kind or _recognise(files)
         found = FORMATS[name].read(files, Hints(image_size_px=image_size_px))
-        told, note = _unit(FORMATS[name], found, unit)
-        rig = Rig({each: scale_lengths(mounted, MM_PER_UNIT[told]) for each, mounted in found.cameras.items()})
+        unit_found, note = _unit(FORMATS[name], found, unit)
+        rig = Rig({each: scale_lengths(mounted, MM_PER_UNIT[unit_found]) for each, mounted in found.cameras.items()})
     return ReadCalibration(rig=rig, format=name, losses=found.losses, notes=found.notes + note)
 
 
@@ -157,9 +157,9 @@ def _recognise(files: Mapping[str, Document]) -> Name:
 
 def _unit(format: Format, found: Calibration, given: Unit | None) -> tuple[Unit, tuple[str, ...]]:
     """The unit of lengths, and what is to be said of it."""
-    told = format.unit if format.tells_unit else found.unit
-    if given is not None or told is not None:
-        return given or told or "mm", ()
+    known_unit = format.unit if format.tells_unit else found.unit
+    if given is not None or known_unit is not None:
+        return given or known_unit or "mm", ()
     centres = [each.centre_in_rig for each in found.cameras.values()]
     apart = max((float(np.linalg.norm(one - other)) for one, other in combinations(centres, 2)), default=0.0)
     usual = format.unit or "mm"
@@ -199,7 +199,7 @@ class CarriedOver:
     """What else is left out."""
 
 
-def carried_over(rig: Rig, kind: Name) -> CarriedOver:
+def fit_to_format(rig: Rig, kind: Name) -> CarriedOver:
     """What a format can hold of a rig. Raises OutputError where that is too little."""
     format = FORMATS[kind]
     if format.write is None and kind != "handpiece":
@@ -210,7 +210,9 @@ def carried_over(rig: Rig, kind: Name) -> CarriedOver:
     lenses = {name: convert_lens(mounted.camera, format.lenses) for name, mounted in rig.cameras.items()}
     cameras = {name: replace(mounted, camera=lenses[name][0]) for name, mounted in rig.cameras.items()}
     notes = []
-    if kind != "handpiece" and any(_is_uncertain(each) for each in rig.cameras.values()):
+    if kind != "handpiece" and any(
+        each.covariance is not None or each.camera.covariance is not None for each in rig.cameras.values()
+    ):
         notes.append(f"{format.title} has no place for covariances: they are left out")
     if not format.keeps_names and count > 1:
         notes.append(f"{format.title} numbers cameras: their order is {', '.join(rig.names)}")
@@ -219,10 +221,6 @@ def carried_over(rig: Rig, kind: Name) -> CarriedOver:
         losses={name: loss for name, (_, loss) in lenses.items() if loss is not None},
         notes=tuple(notes),
     )
-
-
-def _is_uncertain(mounted: MountedCamera) -> bool:
-    return mounted.covariance is not None or mounted.camera.covariance is not None
 
 
 def write_calibration(path: Path, rig: Rig, kind: Name, working_distance_mm: float | None = None) -> None:

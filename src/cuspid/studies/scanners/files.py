@@ -172,7 +172,7 @@ def _from_folder(folder: Path) -> StudyFiles:
     for scanner in sorted(path for path in list_finished(folder) if path.is_dir() and path != home):
         for specimen, path in _of_scanner(scanner, references, remarks):
             scans.append(ScanFile(scanner=scanner.name, specimen=specimen, scan=path.stem, path=path))
-    return StudyFiles(scans=_told_apart(scans), references=references, remarks=tuple(remarks))
+    return StudyFiles(scans=_distinguish_names(scans), references=references, remarks=tuple(remarks))
 
 
 def _of_scanner(scanner: Path, references: Mapping[str, Path], remarks: list[Remark]) -> Iterator[tuple[str, Path]]:
@@ -201,7 +201,7 @@ def _goes_along(path: Path) -> bool:
     return path.stem == _COMMON_BODY or path.stem.endswith(_BESIDE)
 
 
-def _told_apart(scans: Sequence[ScanFile]) -> tuple[ScanFile, ...]:
+def _distinguish_names(scans: Sequence[ScanFile]) -> tuple[ScanFile, ...]:
     """Scans of one name, as a.stl and a.ply, get their endings back."""
     keys = [scan.key for scan in scans]
     return tuple(

@@ -147,7 +147,7 @@ def precision_estimate(groups: Sequence[Float[np.ndarray, "_ _"]]) -> Estimate:
     """The mean over specimens of the mean over all pairs; each group is the symmetric matrix of the figure of pairs."""
     means = [_mean_of_pairs(group) for group in groups]
     value = float(np.mean(means))
-    parts = [_left_out(group, means, k) for k, group in enumerate(groups) if len(group) >= _LEAST_SCANS]
+    parts = [_leave_one_out(group, means, k) for k, group in enumerate(groups) if len(group) >= _LEAST_SCANS]
     variances = np.array([(len(part) - 1) / len(part) * np.sum((part - part.mean()) ** 2) for part in parts])
     if len(parts) < len(groups) or not variances.sum() > 0:
         return Estimate(value=value, low=None, high=None)
@@ -160,7 +160,7 @@ def _mean_of_pairs(matrix: Float[np.ndarray, "n n"]) -> float:
     return float(matrix[np.triu_indices(len(matrix), 1)].mean())
 
 
-def _left_out(matrix: Float[np.ndarray, "n n"], means: Sequence[float], which: int) -> Float[np.ndarray, "n"]:
+def _leave_one_out(matrix: Float[np.ndarray, "n n"], means: Sequence[float], which: int) -> Float[np.ndarray, "n"]:
     """Logarithms of the mean over specimens without each scan of one of them."""
     others = sum(means) - means[which]
     keep = [np.delete(np.arange(len(matrix)), k) for k in range(len(matrix))]
