@@ -12,7 +12,8 @@ where each is from:
     NAMES: PATH [& NAMES: PATH ...] <= LIMIT count         how many values keep it, by their size
     NAMES: PATH <= LIMIT [and NAMES: PATH >= LIMIT ...]    "met" or "missed", by the size of each value
 
-Names of results and the parts of a path may have wildcards. A part ``KEY=VALUE`` keeps what has this value.
+Names of results and the parts of a path may have wildcards. A part ``KEY=VALUE`` keeps what has this value; a
+number takes this entry of a list.
 
 A table with a quoted text has no other figures. What else looks measured on a page of quoted.toml (12 µm, 5 %, 3 s)
 stands in a block (a paragraph, a list item, or a table with what stands above it) that names the commit it was measured
@@ -139,6 +140,8 @@ def _values(where: str, results: Results) -> list[float]:
 def _followed(value: Any, path: Sequence[str]) -> Iterator[Any]:
     if not path:
         yield from () if value is None else (value,)
+    elif isinstance(value, list) and path[0].isdigit():
+        yield from _followed(value[int(path[0])], path[1:])
     elif isinstance(value, list):
         yield from (end for each in value for end in _followed(each, path))
     elif isinstance(value, Mapping) and "=" in path[0]:
@@ -183,7 +186,7 @@ def _measured(block: str, is_table: bool) -> str:
     found = MEASURED.search(rows if is_table else block)
     if found is None and is_table and re.search(UNIT, head):
         found = re.search(r"\d+", rows)
-    return found[0] if found else ""
+    return " ".join(found[0].split()) if found else ""
 
 
 def read_results(folder: Path) -> Results:

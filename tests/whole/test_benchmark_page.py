@@ -301,6 +301,7 @@ def test_figures_are_put_into_a_page_wherever_its_lines_are_broken(freshness):
         ("a: x/*/y ,.0f mean * 1000", "4,000"),
         ("a: x/*/y .2f sd", "3.61"),
         ("a: x/*/of=q/y +.0f", "-3"),
+        ("a: x/r/0/y .0f", "8"),
         ("a: x/*/y <= 3 count", "2"),
         ("a: x/*/y >= 1 and a: x/r/y <= 8", "met"),
         ("a: x/*/y >= 1 and a: x/r/y <= 7.9", "missed"),
