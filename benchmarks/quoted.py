@@ -13,7 +13,7 @@ where each is from:
     NAMES: PATH <= LIMIT [and NAMES: PATH >= LIMIT ...]    "met" or "missed", by the size of each value
 
 Names of results and the parts of a path may have wildcards. A part ``KEY=VALUE`` keeps what has this value; a
-number takes this entry of a list.
+number takes this entry of a list, or this word of a text.
 
 A table with a quoted text has no other figures. What else looks measured on a page of quoted.toml (12 µm, 5 %, 3 s)
 stands in a block (a paragraph, a list item, or a table with what stands above it) that names the commit it was measured
@@ -140,8 +140,9 @@ def _values(where: str, results: Results) -> list[float]:
 def _followed(value: Any, path: Sequence[str]) -> Iterator[Any]:
     if not path:
         yield from () if value is None else (value,)
-    elif isinstance(value, list) and path[0].isdigit():
-        yield from _followed(value[int(path[0])], path[1:])
+    elif isinstance(value, list | str) and path[0].isdigit():
+        entries = value.split() if isinstance(value, str) else value
+        yield from _followed(entries[int(path[0])], path[1:])
     elif isinstance(value, list):
         yield from (end for each in value for end in _followed(each, path))
     elif isinstance(value, Mapping) and "=" in path[0]:

@@ -302,13 +302,14 @@ def test_figures_are_put_into_a_page_wherever_its_lines_are_broken(freshness):
         ("a: x/*/y .2f sd", "3.61"),
         ("a: x/*/of=q/y +.0f", "-3"),
         ("a: x/r/0/y .0f", "8"),
+        ("a: x/q/row/1 .0f", "5"),
         ("a: x/*/y <= 3 count", "2"),
         ("a: x/*/y >= 1 and a: x/r/y <= 8", "met"),
         ("a: x/*/y >= 1 and a: x/r/y <= 7.9", "missed"),
     ],
 )
 def test_what_a_source_says(freshness, source, told):
-    results = {"a": {"x": {"p": {"y": 1}, "q": {"y": -3, "of": "q"}, "r": [{"y": 8}, {"y": None}]}}}
+    results = {"a": {"x": {"p": {"y": 1}, "q": {"y": -3, "of": "q", "row": "4 5"}, "r": [{"y": 8}, {"y": None}]}}}
     assert import_module("quoted").with_figures("so {}.", {"so {}.": [source]}, results) == f"so {told}."
 
 
