@@ -21,8 +21,8 @@ at ("commit 1234567") or the test that holds it ("tests/room/test_it.py"), or th
 
     <!-- given -->
 
-which says that the figures of its block, of the block that follows it, or of the section whose heading follows it, are
-options, definitions, arithmetic or other people's.
+which says that the figures of its block, or of the section whose heading stands below it, are options, definitions,
+arithmetic or other people's.
 """
 
 from __future__ import annotations
@@ -167,18 +167,18 @@ def _without_source(page: str, quoted: Quoted) -> Iterator[str]:
     """The beginnings of blocks with figures that look measured, and of which nothing says where they are from."""
     page = re.compile("|".join(_pattern(text).pattern for text in quoted)).sub("...", page) if quoted else page
     page = NO_PROSE.sub(lambda found: found[0] if DATED.search(found[0]) else "", page)
-    page = re.sub(rf"^ *({GIVEN}|#+ .*)$", r"\n\1\n", page, flags=re.MULTILINE)
-    given, level, above = False, 0, ""
+    page = re.sub(r"^(#+ .*)$", r"\n\1\n", page, flags=re.MULTILINE)
+    level, above = 0, ""
     for block in re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )", page):
+        is_table = block.lstrip().startswith("|")
+        with_mark = f"{above} {block}" if is_table or above.strip() == GIVEN else block
         if heading := re.match(r"\s*(#+) ", block):
-            if given or len(heading[1]) <= level:
-                level = len(heading[1]) if given else 0
-        elif not (given or level or GIVEN in block):
-            is_table = block.lstrip().startswith("|")
-            figure = _measured(block, is_table)
-            if figure and not DATED.search(f"{above} {block}" if is_table else block):
+            if GIVEN in with_mark or len(heading[1]) <= level:
+                level = len(heading[1]) if GIVEN in with_mark else 0
+        elif not level and GIVEN not in with_mark and not DATED.search(with_mark):
+            if figure := _measured(block, is_table):
                 yield f"{' '.join(block.split())[:60]} ({figure})"
-        given, above = block.strip() == GIVEN, block
+        above = block
 
 
 def _measured(block: str, is_table: bool) -> str:
