@@ -175,9 +175,8 @@ def _without_source(page: str, quoted: Quoted) -> Iterator[str]:
         if heading := re.match(r"\s*(#+) ", block):
             if GIVEN in with_mark or len(heading[1]) <= level:
                 level = len(heading[1]) if GIVEN in with_mark else 0
-        elif not level and GIVEN not in with_mark and not DATED.search(with_mark):
-            if figure := _measured(block, is_table):
-                yield f"{' '.join(block.split())[:60]} ({figure})"
+        elif (figure := _measured(block, is_table)) and not (level or GIVEN in with_mark or DATED.search(with_mark)):
+            yield f"{' '.join(block.split())[:60]} ({figure})"
         above = block
 
 
