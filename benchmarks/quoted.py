@@ -51,8 +51,8 @@ ONE: Mapping[str, Callable[[Sequence[float]], float]] = {
     "sd": stdev,
 }
 
-UNIT = r"(?<![\w-])(?:µm|um|%|per mille|s|min|minutes|px|ppm|GiB)(?![\w/²])"
-MEASURED = re.compile(rf"\d\s+(?:CPU[ -])?{UNIT}|\d\s+CPU-s")
+UNIT = r"(?:µm|um|%|per mille|s|CPU-s|min|minutes|ppm|GiB)(?![\w/²])"
+MEASURED = re.compile(rf"\d[\d.,]*\s+{UNIT}|\d+\.\d+\s+px")  # whole pixels are sizes of images and windows
 DATED = re.compile(r"\bcommits?\s+[0-9a-f]{7}|\btests/\w+/test_\w+\.py")
 GIVEN = "<!-- given -->"
 NO_PROSE = re.compile(r"^ *```.*?^ *```$|^\$\$.*?^\$\$|<!-- (?!given).*?-->|`[^`]*`", re.MULTILINE | re.DOTALL)
@@ -100,6 +100,10 @@ def _pattern(text: str) -> re.Pattern[str]:
     return re.compile(r"(\S+?)".join(pieces))
 
 
+def _any_of(quoted: Quoted) -> re.Pattern[str]:
+    return re.compile("|".join(_pattern(text).pattern for text in quoted) or "(?!)")
+
+
 def _told(source: str, results: Results) -> str:
     """A figure, or whether bars are met."""
     if found := FIGURE.fullmatch(source):
@@ -126,7 +130,7 @@ def _values(where: str, results: Results) -> list[float]:
     """Figures on paths through the results of some names."""
     places = [place.split(": ") for place in where.split(" & ")]
     found = [
-        float(value)
+        value
         for names, path in places
         for name, result in results.items()
         if fnmatchcase(name, names)
@@ -137,19 +141,21 @@ def _values(where: str, results: Results) -> list[float]:
     return found
 
 
-def _followed(value: Any, path: Sequence[str]) -> Iterator[Any]:
-    if not path:
-        yield from () if value is None else (value,)
-    elif isinstance(value, list | str) and path[0].isdigit():
-        entries = value.split() if isinstance(value, str) else value
-        yield from _followed(entries[int(path[0])], path[1:])
+def _followed(value: Any, path: Sequence[str]) -> Iterator[float]:
+    """The numbers at the end of a path."""
+    if not path and isinstance(value, int | float):
+        yield float(value)
+    elif isinstance(value, str) and path and path[0].isdigit():
+        yield from _followed([float(word) for word in value.split()], path)
+    elif isinstance(value, list) and path and path[0].isdigit():
+        yield from _followed(value[int(path[0])], path[1:])
     elif isinstance(value, list):
         yield from (end for each in value for end in _followed(each, path))
-    elif isinstance(value, Mapping) and "=" in path[0]:
+    elif isinstance(value, Mapping) and path and "=" in path[0]:
         key, _, kept = path[0].partition("=")
         if fnmatchcase(str(value.get(key)), kept):
             yield from _followed(value, path[1:])
-    elif isinstance(value, Mapping):
+    elif isinstance(value, Mapping) and path:
         for key in value:
             if fnmatchcase(key, path[0]):
                 yield from _followed(value[key], path[1:])
@@ -158,14 +164,14 @@ def _followed(value: Any, path: Sequence[str]) -> Iterator[Any]:
 def _rows_of_other_origin(page: str, quoted: Quoted) -> list[str]:
     """Rows with figures that are not quoted, in tables where others are."""
     tables = re.findall(r"(?:^\|.*\n?)+", page, re.MULTILINE)
-    is_quoted = re.compile("|".join(_pattern(text).pattern for text in quoted))
+    is_quoted = _any_of(quoted)
     touched = [table.splitlines() for table in tables if is_quoted.search(table)]
     return [row for rows in touched for row in rows[2:] if re.search(r"\d", is_quoted.sub("", row))]
 
 
 def _without_source(page: str, quoted: Quoted) -> Iterator[str]:
     """The beginnings of blocks with figures that look measured, and of which nothing says where they are from."""
-    page = re.compile("|".join(_pattern(text).pattern for text in quoted)).sub("...", page) if quoted else page
+    page = _any_of(quoted).sub("...", page)
     page = NO_PROSE.sub(lambda found: found[0] if DATED.search(found[0]) else "", page)
     page = re.sub(r"^(#+ .*)$", r"\n\1\n", page, flags=re.MULTILINE)
     level, above = 0, ""
@@ -184,7 +190,7 @@ def _measured(block: str, is_table: bool) -> str:
     """The first figure that looks measured: with a unit, or in a table whose head has one."""
     head, _, rows = block.strip().partition("\n")
     found = MEASURED.search(rows if is_table else block)
-    if found is None and is_table and re.search(UNIT, head):
+    if found is None and is_table and re.search(rf"(?<![\w-])(?:{UNIT}|px\b)", head):
         found = re.search(r"\d+", rows)
     return " ".join(found[0].split()) if found else ""
 

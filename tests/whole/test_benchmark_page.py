@@ -303,13 +303,16 @@ def test_figures_are_put_into_a_page_wherever_its_lines_are_broken(freshness):
         ("a: x/*/of=q/y +.0f", "-3"),
         ("a: x/r/0/y .0f", "8"),
         ("a: x/q/row/1 .0f", "5"),
+        ("a: x/s .0f", "2-6"),
         ("a: x/*/y <= 3 count", "2"),
         ("a: x/*/y >= 1 and a: x/r/y <= 8", "met"),
         ("a: x/*/y >= 1 and a: x/r/y <= 7.9", "missed"),
     ],
 )
 def test_what_a_source_says(freshness, source, told):
-    results = {"a": {"x": {"p": {"y": 1}, "q": {"y": -3, "of": "q", "row": "4 5"}, "r": [{"y": 8}, {"y": None}]}}}
+    results = {
+        "a": {"x": {"p": {"y": 1}, "q": {"y": -3, "of": "q", "row": "4 5"}, "r": [{"y": 8}, {"y": None}], "s": [2, 6]}}
+    }
     assert import_module("quoted").with_figures("so {}.", {"so {}.": [source]}, results) == f"so {told}."
 
 
@@ -320,6 +323,7 @@ def test_what_a_source_says(freshness, source, told):
         ("a 1; a 2;", {}, "2 times on the page"),
         ("a 1;", {"a {};": ["b: x .1f"]}, "no result has b: x"),
         ("a 1;", {"a {};": ["a: z .1f"]}, "no result has a: z"),
+        ("a 1;", {"a {};": ["a: word .1f"]}, "no result has a: word"),
         ("a 1;", {"a {};": ["a: x"]}, "neither a figure nor a bar"),
         ("a 1;", {"a {};": []}, "0 sources"),
         ("a 1;", {"a {}": ["a: x .1f"]}, "words at its end"),
@@ -334,7 +338,7 @@ def test_what_a_source_says(freshness, source, told):
 def test_a_figure_without_a_result_is_refused(freshness, page, changed, said):
     quoted = import_module("quoted")
     with pytest.raises(quoted.WrongFigureError) as caught:
-        quoted.with_figures(page, changed or {"a {};": ["a: x .1f"]}, {"a": {"x": 1}})
+        quoted.with_figures(page, changed or {"a {};": ["a: x .1f"]}, {"a": {"x": 1, "word": "1"}})
     assert said in str(caught.value)
 
 
