@@ -97,7 +97,7 @@ def with_figures(page: str, quoted: Quoted, results: Results) -> str:
 def _pattern(text: str) -> re.Pattern[str]:
     """A text wherever its lines are broken, a group for each figure."""
     pieces = [r"\s+".join(re.escape(word) for word in re.split(r"\s+", piece)) for piece in text.split("{}")]
-    return re.compile(r"(\S+?)".join(pieces))
+    return re.compile(r"(\S+?)".join(pieces) + r"(?!\d)")
 
 
 def _any_of(quoted: Quoted) -> re.Pattern[str]:
