@@ -171,7 +171,7 @@ def counts(found: Study) -> dict[str, int]:
 
 
 def _print_remarks(remarks: Iterable[Remark]) -> None:
-    lines = [f"{'left out' if each.left_out else 'note'}: {each}" for each in records]
+    lines = [f"{'left out' if each.left_out else 'note'}: {each}" for each in remarks]
     for line in lines[:_MOST_LINES]:
         console.print(line, highlight=False, soft_wrap=True)
     if len(lines) > _MOST_LINES:
@@ -186,8 +186,8 @@ def _print_plan(prepared: Prepared) -> None:
     for scan in prepared.scans:
         groups.setdefault((scan.scanner, scan.specimen), []).append(prepared.records[scan.key])
     for (scanner, specimen), records in groups.items():
-        faces = [each["faces"] for each in records]
-        overlap = [each["overlap"] for each in records]
+        faces = [each["faces"] for each in remarks]
+        overlap = [each["overlap"] for each in remarks]
         table.add_row(
             scanner,
             specimen,
