@@ -186,8 +186,8 @@ def _print_plan(prepared: Prepared) -> None:
     for scan in prepared.scans:
         groups.setdefault((scan.scanner, scan.specimen), []).append(prepared.records[scan.key])
     for (scanner, specimen), records in groups.items():
-        faces = [each["faces"] for each in remarks]
-        overlap = [each["overlap"] for each in remarks]
+        faces = [each["faces"] for each in records]
+        overlap = [each["overlap"] for each in records]
         table.add_row(
             scanner,
             specimen,
