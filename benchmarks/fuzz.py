@@ -58,7 +58,9 @@ def turns(names: Sequence[str], cases: int, first: int) -> list[Turn]:
 
 def run_turns(chosen: Sequence[Turn]) -> dict[str, Any]:
     """Cases done, seconds of the slowest, and what is wrong."""
-    done, slowest, wrong = {}, {}, []
+    done: dict[str, int] = {}
+    slowest: dict[str, float] = {}
+    wrong: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="cuspid-fuzz-") as folder:
         fuzzer = Fuzzer(Path(folder))
         for name, seed in chosen:

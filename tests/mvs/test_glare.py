@@ -127,6 +127,7 @@ def test_polarisers_that_leak_do_little_harm(leak: float, most: float) -> None:
     assert known < 0.95 * unknown
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coloured", [False, True])
 def test_light_that_is_lost_matters_where_the_lights_have_one_colour(coloured: bool) -> None:
     handpiece = lit() if coloured else white(lit())

@@ -79,6 +79,7 @@ def test_every_frame_is_placed_and_pixels_show_what_lies_there(
     assert np.percentile(errors, 95) < 1.3
 
 
+@pytest.mark.long
 def test_the_camera_was_where_it_is_found(stitched: Stitched, film: tuple[Capture, GroundTruth]) -> None:
     assert stitched.motion is not None
     from_rig = film[1].handpiece.rig["camera"].cam_from_rig
@@ -89,6 +90,7 @@ def test_the_camera_was_where_it_is_found(stitched: Stitched, film: tuple[Captur
     assert 1e-5 < errors.max() < 0.1
 
 
+@pytest.mark.long
 def test_the_panorama_is_not_mirrored_and_heights_are_those_of_the_jaw(
     stitched: Stitched, film: tuple[Capture, GroundTruth], sequence: ImageSequence
 ) -> None:
@@ -103,6 +105,7 @@ def test_the_panorama_is_not_mirrored_and_heights_are_those_of_the_jaw(
     assert np.corrcoef(heights, true[:, 2])[0, 1] > 0.4
 
 
+@pytest.mark.long
 def test_overlaps_inliers_and_notes_are_told(stitched: Stitched) -> None:
     frames = stitched.panorama.frames
     assert frames[0].overlap is None
@@ -124,6 +127,7 @@ def test_a_path_that_the_surface_does_not_hold_stays_and_a_note_tells(
     assert any("found again on the surface" in note for note in made.panorama.notes)
 
 
+@pytest.mark.long
 def test_the_strip_is_as_long_as_the_way_of_the_camera(stitched: Stitched) -> None:
     strip = stitched.strip
     assert strip is not None
@@ -246,6 +250,7 @@ def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: 
     assert any(frame.reason == "in part 2" for frame in parts[0].panorama.frames)
 
 
+@pytest.mark.long
 def test_an_empty_picture_is_no_panorama(stitched: Stitched) -> None:
     """Of frames that hardly overlap it was one of status 0 without a pixel."""
     assert require_content([stitched]) == (stitched,)

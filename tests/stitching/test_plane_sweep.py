@@ -219,6 +219,7 @@ def test_cameras_of_one_instant_find_the_step_however_bright_they_show_it(scene:
     assert np.percentile(np.abs(found.interpolate(grid((4.2, 6.0))) + DEEP_MM), 90) < 0.4
 
 
+@pytest.mark.long
 def test_a_plain_spot_in_a_crown_is_bridged(scene: Scene) -> None:
     """Nothing agrees there, as where a highlight goes over a smooth hollow."""
     spot = np.array([0.0, -3.0])
@@ -307,6 +308,7 @@ def test_the_mosaic_shows_each_place_once(scene: Scene, mosaic: Mosaic) -> None:
     assert np.nanpercentile(off, 95) < 0.5
 
 
+@pytest.mark.long
 def test_a_film_of_another_scale_needs_no_more_cells(scene: Scene, surface: HeightMap) -> None:
     """A wrong scale makes the arch ten times larger; so are its pixels."""
     motion = scene.motion.scaled(10.0)

@@ -269,6 +269,7 @@ def test_a_larger_rig_is_taken_to_be_as_well_known_for_its_size(factor: float) -
         assert other.covariance.any()
 
 
+@pytest.mark.long
 def test_a_larger_rig_is_calibrated_alike() -> None:
     capture, factor = scan(), 1000.0
     given = uncertain(capture.handpiece)
@@ -365,6 +366,7 @@ def test_order_and_names_do_not_change_the_scan(change: str, folder: Path) -> No
     check_mesh(mesh, reference)
 
 
+@pytest.mark.long
 def test_a_draft_is_the_same_scan_at_a_glance(folder: Path) -> None:
     """The same frames at about the same places, and the same surface in fewer faces, less exactly."""
     shown = dict[str, tuple[int, int]]()

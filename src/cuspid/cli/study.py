@@ -172,7 +172,7 @@ def counts(found: Study) -> dict[str, int]:
 
 
 def _print_remarks(remarks: Iterable[Remark]) -> None:
-    lines = [f"{'left out' if each.left_out else 'note'}: {each}" for each in records]
+    lines = [f"{'left out' if each.left_out else 'note'}: {each}" for each in remarks]
     for line in lines[:_MOST_LINES]:
         console.print(line, highlight=False, soft_wrap=True)
     if len(lines) > _MOST_LINES:

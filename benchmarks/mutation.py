@@ -1,0 +1,260 @@
+"""Change single places of the code, and see whether the quick tests of their room fail.
+
+    python benchmarks/mutation.py [--mutants 4] [--seed 0] [--only ROOM ...] [--work build/mutation]
+
+In each room of ``src/cuspid`` and in the reproduction, places in the bodies of functions are drawn by the seed: a
+comparison is turned round, + and - or * and / are exchanged, a sign or a ``not`` is dropped, ``and`` and ``or`` are
+exchanged, a number grows by a tenth (a whole one by 1). The room's tests of ``make test`` then run in a copy of the
+project until one fails. Writes benchmarks/results/mutation.json after each room; other rooms in it are kept. Mutants
+that no test can tell from the code, as was found by reading, are named with the reason in mutation_equivalent.toml.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import operator
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from run import conditions
+
+from cuspid.storage import read_json, write_json
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+ROOMS: Mapping[str, tuple[str, str]] = {
+    **{
+        folder.name: (f"src/cuspid/{folder.name}", f"tests/{folder.name}")
+        for folder in sorted((ROOT / "src/cuspid").iterdir())
+        if (folder / "__init__.py").exists()
+    },
+    "thesis": ("reproduction/src/cuspid_thesis", "reproduction/tests"),
+}
+"""Folders of the code and of its tests."""
+QUICK = ("-m", "not documentation and not long", "-x", "-p", "no:cacheprovider")
+LONGEST_S = 600.0
+"""Of the tests of a room: a mutant that never ends fails them, too."""
+_COMPARISONS: Mapping[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Lt: ast.Gt,
+    ast.Gt: ast.Lt,
+    ast.LtE: ast.GtE,
+    ast.GtE: ast.LtE,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+}
+_OPERATORS: Mapping[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+}
+_TEXT = (ast.JoinedStr, ast.List, ast.Tuple)
+"""What is joined by + and repeated by *."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One place of a file, and what stands there instead."""
+
+    file: str
+    line: int
+    begin: int
+    """Bytes of the file before the place."""
+    end: int
+    was: str
+    becomes: str
+
+    @property
+    def name(self) -> str:
+        """For people, and for mutation_equivalent.toml: it lasts while the file only moves lines."""
+        return f"{self.file}: {self.was} -> {self.becomes}"
+
+    def apply(self, source: bytes) -> bytes:
+        """The file with the other text."""
+        return source[: self.begin] + self.becomes.encode() + source[self.end :]
+
+
+def mutants_of(root: Path, folder: str) -> list[Mutant]:
+    """All of a room."""
+    return [
+        mutant
+        for path in sorted((root / folder).rglob("*.py"))
+        for mutant in sorted(
+            _in_source(str(path.relative_to(root)), path.read_bytes()), key=lambda each: (each.begin, each.end)
+        )
+    ]
+
+
+def _in_source(file: str, source: bytes) -> Iterator[Mutant]:
+    starts = np.cumsum([0, *(len(line) for line in source.splitlines(keepends=True))])
+    for node in _in_functions(ast.parse(source)):
+        changed = _changed(node)
+        if changed is None:
+            continue
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
+        begin = int(starts[node.lineno - 1]) + node.col_offset
+        end = int(starts[node.end_lineno - 1]) + node.end_col_offset
+        # In brackets: what is around may bind more strongly, and a line must not end within.
+        yield Mutant(file, node.lineno, begin, end, ast.unparse(node), f"({ast.unparse(changed)})")
+
+
+def _in_functions(tree: ast.AST, inside: bool = False) -> Iterator[ast.expr]:
+    """Expressions in bodies of functions, but for annotations and for what an error says."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef):
+            for statement in node.body:
+                yield from _in_functions(ast.Module([statement], []), inside=True)
+        elif isinstance(node, ast.AnnAssign):
+            if inside and node.value is not None:
+                yield from _in_functions(ast.Expr(node.value), inside)
+        elif not isinstance(node, ast.Raise | ast.JoinedStr | ast.MatchValue):
+            if inside and isinstance(node, ast.expr):
+                yield node
+            yield from _in_functions(node, inside)
+
+
+def _changed(node: ast.expr) -> ast.expr | None:
+    """The other expression; None where there is none."""
+    match node:
+        case ast.Compare(left=left, ops=[only], comparators=right):
+            return ast.Compare(left, [_COMPARISONS[type(only)]()], right)
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS and not (_text(left) or _text(right)):
+            return ast.BinOp(left, _OPERATORS[type(op)](), right)
+        case ast.UnaryOp(op=ast.USub() | ast.Not(), operand=operand):
+            return operand
+        case ast.BoolOp(op=ast.And(), values=values):
+            return ast.BoolOp(ast.Or(), values)
+        case ast.BoolOp(op=ast.Or(), values=values):
+            return ast.BoolOp(ast.And(), values)
+        case ast.Constant(value=bool(value)):
+            return ast.Constant(not value)
+        case ast.Constant(value=int(value)):
+            return ast.Constant(value + 1)
+        case ast.Constant(value=float(value)) if value:
+            return ast.Constant(float(f"{1.1 * value:.12g}"))
+    return None
+
+
+def _text(node: ast.expr) -> bool:
+    return isinstance(node, _TEXT) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+
+
+def draw(mutants: list[Mutant], count: int, seed: int) -> list[Mutant]:
+    """Some of them; with a larger count the same and further ones."""
+    order = np.random.default_rng(seed).permutation(len(mutants))
+    return [mutants[number] for number in order[:count]]
+
+
+def copy_project(to: Path) -> None:
+    """What tests need, with what numba has compiled."""
+    for name in ("src", "tests", "reproduction", "benchmarks", "docs", "examples"):
+        shutil.rmtree(to / name, ignore_errors=True)
+        shutil.copytree(ROOT / name, to / name)
+    for path in ROOT.iterdir():
+        if path.is_file():
+            shutil.copy2(path, to)
+
+
+def tests_of(project: Path, room: str, file: str) -> list[Path]:
+    """A room's files of tests: that of the module before those that name it, and these before all others."""
+    module = Path(file).stem
+
+    def rank(path: Path) -> tuple[bool, bool, str]:
+        return path.stem != f"test_{module}", re.search(rf"\b{module}\b", path.read_text()) is None, path.name
+
+    return sorted((project / ROOMS[room][1]).glob("test_*.py"), key=rank)
+
+
+def first_failure(project: Path, *tests: str) -> str | None:
+    """The first of the quick tests that fails, or what else went wrong; None where all pass."""
+    paths = os.pathsep.join(str(project / each) for each in ("src", "reproduction/src"))
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-m", "pytest", *QUICK, *tests],
+            cwd=project,
+            env={**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_S,
+        )
+    except subprocess.TimeoutExpired:
+        return f"more than {LONGEST_S:g} s"
+    if ended.returncode == 0:
+        return None
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+(?: .*\])?)(?: - .*)?$", ended.stdout, re.MULTILINE)
+    return f"status {ended.returncode} of pytest" if failed is None else failed[1]
+
+
+def caught_by(project: Path, room: str, mutant: Mutant) -> str | None:
+    """The first test of the room that fails with the mutant. Raises SystemExit where that fails without it, too."""
+    path, tests = project / mutant.file, tests_of(project, room, mutant.file)
+    source, before = path.read_bytes(), path.stat()
+    path.write_bytes(mutant.apply(source))
+    try:
+        failed = first_failure(project, *map(str, tests))
+    finally:
+        path.write_bytes(source)
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    if failed is None:
+        return None
+    file = failed.split("::")[0]
+    again = (failed,) if "::" in failed else (file,) if file.endswith(".py") else tuple(map(str, tests))
+    if (still := first_failure(project, *again)) is not None:
+        raise SystemExit(f"this fails without any mutant: {still}")
+    return failed
+
+
+def measure_room(project: Path, room: str, count: int, seed: int, equivalent: Mapping[str, str]) -> dict[str, Any]:
+    """What became of the mutants of a room."""
+    rows = []
+    for mutant in draw(mutants_of(project, ROOMS[room][0]), count, seed):
+        why = equivalent.get(mutant.name)
+        failed = None if why is not None else caught_by(project, room, mutant)
+        rows.append({"mutant": mutant.name, "line": mutant.line, "caught_by": failed, "equivalent": why})
+        print(f"{room}, line {mutant.line} of {mutant.name}: {failed or why or 'SURVIVED'}", flush=True)
+    return {
+        "tried": sum(row["equivalent"] is None for row in rows),
+        "caught": sum(row["caught_by"] is not None for row in rows),
+        "commit": conditions()["commit"],
+        "mutants": rows,
+    }
+
+
+def main() -> None:
+    """Room after room."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--mutants", type=int, default=4, help="of each room")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="*", choices=ROOMS, default=tuple(ROOMS), help="rooms")
+    parser.add_argument("--work", type=Path, default=ROOT / "build" / "mutation")
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "mutation.json")
+    arguments = parser.parse_args()
+    equivalent = tomllib.loads((HERE / "mutation_equivalent.toml").read_text())
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    copy_project(arguments.work)
+    rooms = read_json(arguments.out)["rooms"] if arguments.out.exists() else {}
+    for room in arguments.only:
+        rooms[room] = measure_room(arguments.work, room, arguments.mutants, arguments.seed, equivalent)
+        found = {"seed": arguments.seed, "rooms": {each: rooms[each] for each in ROOMS if each in rooms}}
+        write_json(arguments.out, {**found, **conditions()})
+    totals = operator.itemgetter("caught", "tried")
+    print("\n".join(f"{room}: {totals(row)[0]} of {totals(row)[1]}" for room, row in rooms.items()))
+
+
+if __name__ == "__main__":
+    main()
