@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import operator
 import os
 import re
 import shutil
@@ -252,8 +251,7 @@ def main() -> None:
         rooms[room] = measure_room(arguments.work, room, arguments.mutants, arguments.seed, equivalent)
         found = {"seed": arguments.seed, "rooms": {each: rooms[each] for each in ROOMS if each in rooms}}
         write_json(arguments.out, {**found, **conditions()})
-    totals = operator.itemgetter("caught", "tried")
-    print("\n".join(f"{room}: {totals(row)[0]} of {totals(row)[1]}" for room, row in rooms.items()))
+    print("\n".join(f"{room}: {row['caught']} of {row['tried']} caught" for room, row in rooms.items()))
 
 
 if __name__ == "__main__":

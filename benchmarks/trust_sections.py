@@ -1,4 +1,4 @@
-"""Sections of the pages of results on qualities, what scans expect, damaged input, killed runs and large meshes."""
+"""Sections of the pages of results on qualities, what scans expect, damaged input, killed runs, tests, large meshes."""
 
 from __future__ import annotations
 
@@ -160,6 +160,31 @@ def kill(result: Result) -> str:
 
 def _wrong(result: Result, verb: str) -> int:
     return sum(run["verb"] == verb for run in result["wrong"])
+
+
+def mutation(result: Result) -> str:
+    """Single changes of the code, by room."""
+    rooms = result["rooms"]
+    rows = [
+        (name, room["tried"], room["caught"], ", ".join(_survivors(room)) or "none") for name, room in rooms.items()
+    ]
+    tried, caught = (sum(room[what] for room in rooms.values()) for what in ("tried", "caught"))
+    return "\n".join(
+        [
+            "Places drawn by a seed are changed one at a time: a comparison, an operator, a sign, a number by a tenth "
+            "(a whole one by 1). Caught are those with which a test of the same room fails that `make test` runs. "
+            "Changes that make no difference, as was found by reading, do not count "
+            "(`benchmarks/mutation_equivalent.toml`). `python benchmarks/mutation.py`.",
+            "",
+            markdown_table(("room", "changes", "caught", "not caught"), [*rows, ("all", tried, caught, "")]),
+        ]
+    )
+
+
+def _survivors(room: Result) -> list[str]:
+    """Where they are."""
+    missed = [row for row in room["mutants"] if row["caught_by"] is None and row["equivalent"] is None]
+    return [f"`{row['mutant'].split(': ')[0].split('/')[-1]}:{row['line']}`" for row in missed]
 
 
 def large(result: Result) -> str:
