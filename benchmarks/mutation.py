@@ -76,11 +76,13 @@ class Mutant:
     end: int
     was: str
     becomes: str
+    code: str
+    """The line on which the place begins."""
 
     @property
     def name(self) -> str:
-        """For people, and for mutation_equivalent.toml: it lasts while the file only moves lines."""
-        return f"{self.file}: {self.was} -> {self.becomes}"
+        """For people, and for mutation_equivalent.toml: it lasts while lines only move within their file."""
+        return f"{self.file}: {self.was} -> {self.becomes} in {self.code}"
 
     def apply(self, source: bytes) -> bytes:
         """The file with the other text."""
@@ -99,7 +101,8 @@ def mutants_of(root: Path, folder: str) -> list[Mutant]:
 
 
 def _in_source(file: str, source: bytes) -> Iterator[Mutant]:
-    starts = np.cumsum([0, *(len(line) for line in source.splitlines(keepends=True))])
+    lines = source.splitlines(keepends=True)
+    starts = np.cumsum([0, *map(len, lines)])
     for node in _in_functions(ast.parse(source)):
         changed = _changed(node)
         if changed is None:
@@ -108,8 +111,9 @@ def _in_source(file: str, source: bytes) -> Iterator[Mutant]:
         assert node.end_col_offset is not None
         begin = int(starts[node.lineno - 1]) + node.col_offset
         end = int(starts[node.end_lineno - 1]) + node.end_col_offset
-        # In brackets: what is around may bind more strongly, and a line must not end within.
-        yield Mutant(file, node.lineno, begin, end, ast.unparse(node), f"({ast.unparse(changed)})")
+        becomes = f"({ast.unparse(changed)})"  # what is around may bind more strongly, and a line must not end within
+        code = lines[node.lineno - 1].decode().strip()
+        yield Mutant(file, node.lineno, begin, end, ast.unparse(node), becomes, code)
 
 
 def _in_functions(tree: ast.AST, inside: bool = False) -> Iterator[ast.expr]:

@@ -49,6 +49,7 @@ def test_bodies_of_functions_are_changed_at_one_place_each(mutation: ModuleType,
         ("1", "(2)"),
         ("True", "(False)"),
     ]
+    assert mutants[0].name == 'room/grow.py: -size -> (size) in left: "2 n" = -size'
     whole = SOURCE.encode()
     for each in mutants:
         changed = each.apply(whole)
