@@ -41,7 +41,7 @@ ROOMS: Mapping[str, tuple[str, str]] = {
 }
 """Folders of the code and of its tests."""
 QUICK = ("-m", "not documentation and not long", "-x", "-p", "no:cacheprovider")
-LONGEST_S = 600.0
+LONGEST_S = 300.0
 """Of the tests of a room: a mutant that never ends fails them, too."""
 _COMPARISONS: Mapping[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.Gt,
