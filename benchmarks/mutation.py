@@ -4,9 +4,10 @@
 
 In each room of ``src/cuspid`` and in the reproduction, places in the bodies of functions are drawn by the seed: a
 comparison is turned round, + and - or * and / are exchanged, a sign or a ``not`` is dropped, ``and`` and ``or`` are
-exchanged, a number grows by a tenth (a whole one by 1). The room's tests of ``make test`` then run in a copy of the
-project until one fails. Writes benchmarks/results/mutation.json after each room; other rooms in it are kept. Mutants
-that no test can tell from the code, as was found by reading, are named with the reason in mutation_equivalent.toml.
+exchanged, a number grows by a tenth (a whole one by 1). The room's tests of ``make test``, and then those of other
+rooms that import the module, run in a copy of the project until one fails. Writes benchmarks/results/mutation.json
+after each room; other rooms in it are kept. Mutants that no test can tell from the code, as was found by reading, are
+named with the reason in mutation_equivalent.toml.
 """
 
 from __future__ import annotations
@@ -173,14 +174,19 @@ def copy_project(to: Path) -> None:
             shutil.copy2(path, to)
 
 
-def tests_of(project: Path, room: str, file: str) -> list[Path]:
-    """A room's files of tests: that of the module before those that name it, and these before all others."""
+def tests_of(project: Path, room: str, file: str) -> tuple[list[Path], list[Path]]:
+    """A room's files of tests: that of the module before those that name it, and these before all others; and those of
+    other rooms that import it."""
     module = Path(file).stem
+    folders = {name: project / tests for name, (_, tests) in ROOMS.items()} | {"whole": project / "tests/whole"}
+    texts = {name: {path: path.read_text() for path in folders[name].glob("test_*.py")} for name in folders}
 
     def rank(path: Path) -> tuple[bool, bool, str]:
-        return path.stem != f"test_{module}", re.search(rf"\b{module}\b", path.read_text()) is None, path.name
+        return path.stem != f"test_{module}", re.search(rf"\b{module}\b", texts[room][path]) is None, path.name
 
-    return sorted((project / ROOMS[room][1]).glob("test_*.py"), key=rank)
+    imported = re.compile(rf"^(?:from|import) (?:cuspid|cuspid_thesis)\b[\w.]*[ .(\w,]*\b{module}\b", re.MULTILINE)
+    others = [path for name in folders if name != room for path, text in texts[name].items() if imported.search(text)]
+    return sorted(texts[room], key=rank), sorted(others)
 
 
 def first_failure(project: Path, *tests: str) -> str | None:
@@ -204,20 +210,21 @@ def first_failure(project: Path, *tests: str) -> str | None:
 
 
 def caught_by(project: Path, room: str, mutant: Mutant) -> str | None:
-    """The first test of the room that fails with the mutant. Raises SystemExit where that fails without it, too."""
-    path, tests = project / mutant.file, tests_of(project, room, mutant.file)
+    """The first test that fails with the mutant, one of the room where there is one. Raises SystemExit where that test
+    fails without the mutant, too."""
+    path, failed = project / mutant.file, None
     source, before = path.read_bytes(), path.stat()
     path.write_bytes(mutant.apply(source))
     try:
-        failed = first_failure(project, *map(str, tests))
+        for tests in tests_of(project, room, mutant.file):
+            if failed is None and tests:
+                failed = first_failure(project, *map(str, tests))
     finally:
         path.write_bytes(source)
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     if failed is None:
         return None
-    file = failed.split("::")[0]
-    again = (failed,) if "::" in failed else (file,) if file.endswith(".py") else tuple(map(str, tests))
-    if (still := first_failure(project, *again)) is not None:
+    if ".py" in failed and (still := first_failure(project, failed)) is not None:
         raise SystemExit(f"this fails without any mutant: {still}")
     return failed
 
@@ -230,9 +237,11 @@ def measure_room(project: Path, room: str, count: int, seed: int, equivalent: Ma
         failed = None if why is not None else caught_by(project, room, mutant)
         rows.append({"mutant": mutant.name, "line": mutant.line, "caught_by": failed, "equivalent": why})
         print(f"{room}, line {mutant.line} of {mutant.name}: {failed or why or 'SURVIVED'}", flush=True)
+    caught = [row["caught_by"] for row in rows if row["caught_by"] is not None]
     return {
         "tried": sum(row["equivalent"] is None for row in rows),
-        "caught": sum(row["caught_by"] is not None for row in rows),
+        "caught": len(caught),
+        "elsewhere": sum(".py" in each and not each.startswith(f"{ROOMS[room][1]}/") for each in caught),
         "commit": conditions()["commit"],
         "mutants": rows,
     }

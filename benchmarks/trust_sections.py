@@ -164,19 +164,18 @@ def _wrong(result: Result, verb: str) -> int:
 
 def mutation(result: Result) -> str:
     """Single changes of the code, by room."""
-    rooms = result["rooms"]
-    rows = [
-        (name, room["tried"], room["caught"], ", ".join(_survivors(room)) or "none") for name, room in rooms.items()
-    ]
-    tried, caught = (sum(room[what] for room in rooms.values()) for what in ("tried", "caught"))
+    counts = ("tried", "caught", "elsewhere")
+    rooms: Mapping[str, Result] = result["rooms"]
+    rows = [(name, *(room[each] for each in counts), ", ".join(_survivors(room))) for name, room in rooms.items()]
+    rows.append(("all", *(sum(room[each] for room in rooms.values()) for each in counts), ""))
     return "\n".join(
         [
             "Places drawn by a seed are changed one at a time: a comparison, an operator, a sign, a number by a tenth "
-            "(a whole one by 1). Caught are those with which a test of the same room fails that `make test` runs. "
-            "Changes that make no difference, as was found by reading, do not count "
-            "(`benchmarks/mutation_equivalent.toml`). `python benchmarks/mutation.py`.",
+            "(a whole one by 1). Caught are those with which a test fails that `make test` runs: one of the same room "
+            "or, where none does, one of another room that imports the module. Changes that make no difference, as was "
+            "found by reading, do not count (`benchmarks/mutation_equivalent.toml`). `python benchmarks/mutation.py`.",
             "",
-            markdown_table(("room", "changes", "caught", "not caught"), [*rows, ("all", tried, caught, "")]),
+            markdown_table(("room", "changes", "caught", "in other rooms", "not caught"), rows),
         ]
     )
 
