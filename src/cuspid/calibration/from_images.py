@@ -61,6 +61,7 @@ def calibrate(
     distance of the board. Raises ReconstructionError, which names the cause, where a camera hardly saw the board as it
     was described, and InputError where nothing tells which images were taken together.
     """
+    _require_images(images)
     images, named_notes = _match_frames(images)
     views = _views(images, board, progress)
     _require_views(images, views, board)
@@ -76,6 +77,16 @@ def calibrate(
     read = (note for each in images.values() for note in each.notes)
     found = replace(found, notes=(*read, *named_notes, *_unseen(images, views), *drawn_notes, *found.notes))
     return Calibration(handpiece=_handpiece(found, light, drawn, working_distance_mm), rig=found, light=light)
+
+
+def _require_images(sequences: Mapping[str, ImageSequence]) -> None:
+    """Raise ReconstructionError where a camera cannot be calibrated whatever its images show."""
+    few = [f"{name} {len(each)}" for name, each in sequences.items() if len(each) < LEAST_VIEWS]
+    if few:
+        raise ReconstructionError(
+            f"calibration: images of the board at {LEAST_VIEWS} instants or more are needed of each camera, but there "
+            f"are fewer ({', '.join(few)}); hold it in further places, tilted by 20 to 50 degrees"
+        )
 
 
 def _light(

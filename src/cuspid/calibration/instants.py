@@ -18,7 +18,7 @@ def common_instants(names: Mapping[str, Sequence[str]]) -> Mapping[str, tuple[st
     """
     if len(names) < 2 or _have_common(names):
         return None
-    numbers = {camera: _numbers(each) for camera, each in names.items()}
+    numbers = {camera: numbers_in(each) for camera, each in names.items()}
     if any(each is None for each in numbers.values()) or not _have_common(numbers):
         shown = ", ".join(f"{camera}: {each[0]}" for camera, each in names.items() if each)
         raise InputError(
@@ -37,7 +37,7 @@ def _have_common(names: Mapping[str, Sequence[object] | None]) -> bool:
     return len(set().union(*seen)) < sum(map(len, seen))
 
 
-def _numbers(names: Sequence[str]) -> list[tuple[int, ...]] | None:
+def numbers_in(names: Sequence[str]) -> list[tuple[int, ...]] | None:
     """Of each name the numbers that change from image to image; None if they do not tell the images apart."""
     found = [tuple(map(int, _DIGITS.findall(name))) for name in names]
     if not found or len({len(each) for each in found}) > 1:

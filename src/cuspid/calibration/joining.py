@@ -18,7 +18,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.calibration.agreement import agreed_on
+from cuspid.calibration.agreement import agreed_on, disagreement_between
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.corners import BoardView, Views, split_by_board
 from cuspid.calibration.start import board_pose
@@ -154,9 +154,14 @@ def _join_two_groups(groups: _Groups, seen: Sequence[_Seen]) -> _Groups | None:
     side = 0 if kind == "cameras" else 1
     said = _estimate_hand_eye(poses, one, other, side)
     away = [pose.translation for each in poses.values() for pose in each.values()]
-    best, agreeing = agreed_on([[each] for each in said], float(np.median(np.linalg.norm(away, axis=1))))
+    distance_mm = float(np.median(np.linalg.norm(away, axis=1)))
+    best, agreeing, _ = agreed_on([[each] for each in said], distance_mm)
     if 2 * agreeing < len(said):
-        raise ReconstructionError(_disagreement(groups, kind, one, other, agreeing, len(said)))
+        if kind == "boards":
+            raise ReconstructionError(_disagreement(groups, one, other, agreeing, len(said)))
+        named = ", ".join(groups.cameras_of(other)), ", ".join(groups.cameras_of(one))
+        own = _poses_to_compare(poses, other, one)
+        raise ReconstructionError(disagreement_between(named, own, agreeing, len(said), distance_mm))
     return groups.joined_cameras(one, other, best) if side == 0 else groups.joined_boards(one, other, best)
 
 
@@ -174,13 +179,17 @@ def _estimate_hand_eye(
     return said
 
 
-def _disagreement(groups: _Groups, kind: str, one: int, other: int, agreeing: int, count: int) -> str:
-    if kind == "cameras":
-        first, second = (", ".join(groups.cameras_of(each)) for each in (one, other))
-        return (
-            f"calibration: only {agreeing} of {count} instants agree on the pose of {second} relative to {first}; "
-            "check that they were triggered together, and that images with the same name belong together"
-        )
+def _poses_to_compare(
+    poses: Mapping[tuple[int, int], Mapping[str, Rigid3]], one: int, other: int
+) -> tuple[dict[str, list[Rigid3]], dict[str, list[Rigid3]]]:
+    """The poses, by instant, of the boards that both of two groups of cameras saw most often."""
+    boards = [board for group, board in poses if group == one and (other, board) in poses]
+    most = max(boards, key=lambda board: min(len(poses[one, board]), len(poses[other, board])))
+    first, second = ({instant: [pose] for instant, pose in poses[each, most].items()} for each in (one, other))
+    return first, second
+
+
+def _disagreement(groups: _Groups, one: int, other: int, agreeing: int, count: int) -> str:
     first, second = (_numbers(groups.boards_of(each)) for each in (one, other))
     return (
         f"calibration: only {agreeing} of {count} instants agree on where {second} is relative to {first}; the boards "
