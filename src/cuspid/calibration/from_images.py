@@ -20,7 +20,7 @@ from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.rig import Handpiece, depth_of_field_mm
 from cuspid.runtime.errors import ReconstructionError
-from cuspid.runtime.image_files import Pixels, visible_grey
+from cuspid.runtime.image_files import Pixels, full_range_grey
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.values import join_names
 from cuspid.runtime.workers import map_in_threads
@@ -134,7 +134,7 @@ def _views(sequences: Mapping[str, ImageSequence], board: Target, progress: Prog
 
     def find(image: tuple[str, int]) -> BoardView | None:
         camera, index = image
-        return find_corners(visible_grey(sequences[camera].fine_image(index)), board)
+        return find_corners(full_range_grey(sequences[camera].fine_image(index)), board)
 
     found = map_in_threads(find, images, stage="corners", progress=progress)
     return {
@@ -180,7 +180,7 @@ def _other_circles(sequences: Mapping[str, ImageSequence], views: Views, board: 
 def _some(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:
     """A few of some images, evenly, in grey."""
     tried = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, MOST_TRIED).astype(int))] if indices else []
-    return [visible_grey(sequence.fine_image(index)) for index in tried]
+    return [full_range_grey(sequence.fine_image(index)) for index in tried]
 
 
 def _unseen(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[str]:

@@ -80,6 +80,14 @@ def visible_grey(image: Pixels) -> UInt8[np.ndarray, "h w"]:
     return visible_in_8_bits(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
 
 
+def full_range_grey(image: Pixels) -> UInt8[np.ndarray, "h w"]:
+    """An RGB image in grey; of more than 8 bits with the whole range of 8, however bright it is: where the corners of a
+    chessboard are found depends on the contrast, by up to 0.3 px."""
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    bright = 0.0 if grey.dtype == np.uint8 else float(np.percentile(grey[::2, ::2], _BRIGHT_PERCENTILES[0]))
+    return np.asarray(cv2.convertScaleAbs(grey, alpha=255 / bright), np.uint8) if bright > 0 else as_8_bits(grey)
+
+
 def brighten(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """A dark image stretched to the whole range: the contrast of a keypoint is a share of it. Others as they are."""
     factor = _brightening(grey)
