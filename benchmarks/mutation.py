@@ -1,19 +1,19 @@
 """Change single places of the code, and see whether the quick tests of their room fail.
 
-    python benchmarks/mutation.py [--mutants 4] [--seed 0] [--only ROOM ...] [--work build/mutation]
+    python benchmarks/mutation.py [--mutants 3] [--seed 0] [--only ROOM ...] [--work build/mutation]
 
 In each room of ``src/cuspid`` and in the reproduction, places in the bodies of functions are drawn by the seed: a
 comparison is turned round, + and - or * and / are exchanged, a sign or a ``not`` is dropped, ``and`` and ``or`` are
-exchanged, a number grows by a tenth (a whole one by 1). The room's tests of ``make test`` then run in a copy of the
-project until one fails. Writes benchmarks/results/mutation.json after each room; other rooms in it are kept. Mutants
-that no test can tell from the code, as was found by reading, are named with the reason in mutation_equivalent.toml.
+exchanged, a number grows by a tenth (a whole one by 1). The room's tests of ``make test``, and then those of other
+rooms that import the module, run in a copy of the project until one fails. Writes benchmarks/results/mutation.json
+after each room; other rooms in it are kept. Mutants that no test can tell from the code, as was found by reading, are
+named with the reason in mutation_equivalent.toml.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import operator
 import os
 import re
 import shutil
@@ -42,7 +42,7 @@ ROOMS: Mapping[str, tuple[str, str]] = {
 }
 """Folders of the code and of its tests."""
 QUICK = ("-m", "not documentation and not long", "-x", "-p", "no:cacheprovider")
-LONGEST_S = 600.0
+LONGEST_S = 300.0
 """Of the tests of a room: a mutant that never ends fails them, too."""
 _COMPARISONS: Mapping[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.Gt,
@@ -77,11 +77,13 @@ class Mutant:
     end: int
     was: str
     becomes: str
+    code: str
+    """The line on which the place begins."""
 
     @property
     def name(self) -> str:
-        """For people, and for mutation_equivalent.toml: it lasts while the file only moves lines."""
-        return f"{self.file}: {self.was} -> {self.becomes}"
+        """For people, and for mutation_equivalent.toml: it lasts while lines only move within their file."""
+        return f"{self.file}: {self.was} -> {self.becomes} in {self.code}"
 
     def apply(self, source: bytes) -> bytes:
         """The file with the other text."""
@@ -100,7 +102,8 @@ def mutants_of(root: Path, folder: str) -> list[Mutant]:
 
 
 def _in_source(file: str, source: bytes) -> Iterator[Mutant]:
-    starts = np.cumsum([0, *(len(line) for line in source.splitlines(keepends=True))])
+    lines = source.splitlines(keepends=True)
+    starts = np.cumsum([0, *map(len, lines)])
     for node in _in_functions(ast.parse(source)):
         changed = _changed(node)
         if changed is None:
@@ -109,8 +112,9 @@ def _in_source(file: str, source: bytes) -> Iterator[Mutant]:
         assert node.end_col_offset is not None
         begin = int(starts[node.lineno - 1]) + node.col_offset
         end = int(starts[node.end_lineno - 1]) + node.end_col_offset
-        # In brackets: what is around may bind more strongly, and a line must not end within.
-        yield Mutant(file, node.lineno, begin, end, ast.unparse(node), f"({ast.unparse(changed)})")
+        becomes = f"({ast.unparse(changed)})"  # what is around may bind more strongly, and a line must not end within
+        code = lines[node.lineno - 1].decode().strip()
+        yield Mutant(file, node.lineno, begin, end, ast.unparse(node), becomes, code)
 
 
 def _in_functions(tree: ast.AST, inside: bool = False) -> Iterator[ast.expr]:
@@ -170,14 +174,19 @@ def copy_project(to: Path) -> None:
             shutil.copy2(path, to)
 
 
-def tests_of(project: Path, room: str, file: str) -> list[Path]:
-    """A room's files of tests: that of the module before those that name it, and these before all others."""
+def tests_of(project: Path, room: str, file: str) -> tuple[list[Path], list[Path]]:
+    """A room's files of tests: that of the module before those that name it, and these before all others; and those of
+    other rooms that import it."""
     module = Path(file).stem
+    folders = {name: project / tests for name, (_, tests) in ROOMS.items()} | {"whole": project / "tests/whole"}
+    texts = {name: {path: path.read_text() for path in folders[name].glob("test_*.py")} for name in folders}
 
     def rank(path: Path) -> tuple[bool, bool, str]:
-        return path.stem != f"test_{module}", re.search(rf"\b{module}\b", path.read_text()) is None, path.name
+        return path.stem != f"test_{module}", re.search(rf"\b{module}\b", texts[room][path]) is None, path.name
 
-    return sorted((project / ROOMS[room][1]).glob("test_*.py"), key=rank)
+    imported = re.compile(rf"^(?:from|import) (?:cuspid|cuspid_thesis)\b[\w.]*[ .(\w,]*\b{module}\b", re.MULTILINE)
+    others = [path for name in folders if name != room for path, text in texts[name].items() if imported.search(text)]
+    return sorted(texts[room], key=rank), sorted(others)
 
 
 def first_failure(project: Path, *tests: str) -> str | None:
@@ -201,35 +210,38 @@ def first_failure(project: Path, *tests: str) -> str | None:
 
 
 def caught_by(project: Path, room: str, mutant: Mutant) -> str | None:
-    """The first test of the room that fails with the mutant. Raises SystemExit where that fails without it, too."""
-    path, tests = project / mutant.file, tests_of(project, room, mutant.file)
+    """The first test that fails with the mutant, one of the room where there is one. Raises SystemExit where that test
+    fails without the mutant, too."""
+    path, failed = project / mutant.file, None
     source, before = path.read_bytes(), path.stat()
     path.write_bytes(mutant.apply(source))
     try:
-        failed = first_failure(project, *map(str, tests))
+        for tests in tests_of(project, room, mutant.file):
+            if failed is None and tests:
+                failed = first_failure(project, *map(str, tests))
     finally:
         path.write_bytes(source)
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     if failed is None:
         return None
-    file = failed.split("::")[0]
-    again = (failed,) if "::" in failed else (file,) if file.endswith(".py") else tuple(map(str, tests))
-    if (still := first_failure(project, *again)) is not None:
+    if ".py" in failed and (still := first_failure(project, failed)) is not None:
         raise SystemExit(f"this fails without any mutant: {still}")
     return failed
 
 
 def measure_room(project: Path, room: str, count: int, seed: int, equivalent: Mapping[str, str]) -> dict[str, Any]:
     """What became of the mutants of a room."""
-    rows = []
+    rows, caught = [], list[str]()
     for mutant in draw(mutants_of(project, ROOMS[room][0]), count, seed):
         why = equivalent.get(mutant.name)
         failed = None if why is not None else caught_by(project, room, mutant)
+        caught += [] if failed is None else [failed]
         rows.append({"mutant": mutant.name, "line": mutant.line, "caught_by": failed, "equivalent": why})
         print(f"{room}, line {mutant.line} of {mutant.name}: {failed or why or 'SURVIVED'}", flush=True)
     return {
         "tried": sum(row["equivalent"] is None for row in rows),
-        "caught": sum(row["caught_by"] is not None for row in rows),
+        "caught": len(caught),
+        "elsewhere": sum(".py" in each and not each.startswith(f"{ROOMS[room][1]}/") for each in caught),
         "commit": conditions()["commit"],
         "mutants": rows,
     }
@@ -238,7 +250,7 @@ def measure_room(project: Path, room: str, count: int, seed: int, equivalent: Ma
 def main() -> None:
     """Room after room."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mutants", type=int, default=4, help="of each room")
+    parser.add_argument("--mutants", type=int, default=3, help="of each room")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", choices=ROOMS, default=tuple(ROOMS), help="rooms")
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "mutation")
@@ -252,8 +264,7 @@ def main() -> None:
         rooms[room] = measure_room(arguments.work, room, arguments.mutants, arguments.seed, equivalent)
         found = {"seed": arguments.seed, "rooms": {each: rooms[each] for each in ROOMS if each in rooms}}
         write_json(arguments.out, {**found, **conditions()})
-    totals = operator.itemgetter("caught", "tried")
-    print("\n".join(f"{room}: {totals(row)[0]} of {totals(row)[1]}" for room, row in rooms.items()))
+    print("\n".join(f"{room}: {row['caught']} of {row['tried']} caught" for room, row in rooms.items()))
 
 
 if __name__ == "__main__":

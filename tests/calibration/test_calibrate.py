@@ -319,9 +319,10 @@ def test_cameras_that_were_not_triggered_together_are_refused():
     views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
     count = len(truth.rig_from_board)
     late = {(name, f"{(int(instant) + (name == 'cam1')) % count:02d}"): view for (name, instant), view in views.items()}
-    with pytest.raises(
-        ReconstructionError, match=r"only \d+ of 16 instants agree on the pose of cam1 relative to cam0"
-    ):
+    told = (
+        r"only \d+ of 16 instants agree on the pose of cam1 relative to cam0, but 15 of 15 do if cam0 began 1 instant "
+    )
+    with pytest.raises(ReconstructionError, match=told):
         calibrated(truth, late)
 
 
@@ -509,7 +510,7 @@ def test_too_few_views_are_refused():
     truth = scene(7)
     views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
     few = {key: view for key, view in views.items() if key[0] != "cam2" or key[1] in ("00", "01")}
-    with pytest.raises(ReconstructionError, match="cam2 saw the board at fewer than 3 instants"):
+    with pytest.raises(ReconstructionError, match=r"3 instants or more by each camera, but is at fewer \(cam2 2\)"):
         calibrated(truth, few)
 
 
@@ -576,7 +577,10 @@ def test_what_cannot_be_calibrated_is_one_line(tmp_path, capsys):
     for index in range(3):
         storage.write_image(tmp_path / "gray" / "left" / f"{index}.png", np.full((64, 64, 3), 128, np.uint8))
     message = refused(capsys, "calibrate", tmp_path / "gray", "--out", out)
-    assert "left saw the board at fewer than 3 instants" in message
+    assert "is at fewer (left 0)" in message
+    (tmp_path / "gray" / "left" / "2.png").unlink()
+    message = refused(capsys, "calibrate", tmp_path / "gray", "--out", out)
+    assert "at 3 instants or more are needed of each camera, but there are fewer (left 2)" in message
     assert not out.exists()
     assert "a board is written as .pdf" in refused(capsys, "rig", "target", "--out", tmp_path / "board.txt")
 
@@ -589,25 +593,27 @@ def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
     photographs(tmp_path / "photos", truth, board)
     run("calibrate", tmp_path / "photos", "--out", tmp_path / "rig", *options(board))
     before = {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()}
-    other = (*options(board), "--dictionary", "7X7_50")  # a chessboard would be looked for 36 times, 0.7 s each
-    assert "its markers are of another family" in refused(
+    other = options(replace(board, kind="chessboard", columns=5))
+    assert "give --kind charuco --dictionary 4X4_1000 --columns 8 --rows 8, with its --square-mm" in refused(
         capsys, "calibrate", tmp_path / "photos", "--out", tmp_path / "rig", *other
     )
     assert {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()} == before
 
 
-def test_a_dark_board_of_16_bits_has_the_corners_of_a_bright_one(tmp_path):
+@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
+def test_a_dark_board_of_16_bits_has_the_corners_of_a_bright_one(tmp_path, kind):
     """Of which 8 bits would leave 16 levels of grey."""
-    board = Board(columns=8, rows=8, square_mm=2.0)
+    board = Board(kind=kind, columns=8, rows=8, square_mm=2.0)
     truth = undistorted(scene(10, board, cameras=1, instants=1).cameras["cam0"])
-    seen = np.dstack([photograph(board, truth, pose_before(board, 24.0, 30.0)).astype(np.uint16)] * 3)
+    pose = pose_before(board, 24.0, 35.0, roll_deg=120.0)
+    seen = np.dstack([photograph(board, truth, pose, seed=5).astype(np.uint16)] * 3)
     bright = 257 * seen + np.random.default_rng(0).integers(0, 257, seen.shape).astype(np.uint16)
     storage.write_image(tmp_path / "cam/1.png", bright)
     storage.write_image(tmp_path / "cam/2.png", bright // 16)
     views = from_images._views({"cam": storage.read_sequence(tmp_path / "cam")}, board, silent)
     one, other = views["cam", "1"], views["cam", "2"]
     assert np.array_equal(one.corner, other.corner)
-    assert len(one.corner) == 49
+    assert len(one.corner) >= 48
     assert 0 < np.abs(one.pixels - other.pixels).max() < 0.02
 
 

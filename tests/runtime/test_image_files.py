@@ -16,6 +16,7 @@ from PIL import Image
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.image_files import (
     as_8_bits,
+    common_brightening,
     exif_orientation,
     image_size,
     read_deep,
@@ -138,10 +139,11 @@ def test_sizes_are_those_of_the_upright_image(tmp_path: Path, name: str, orienta
         assert np.array_equal(back, COLOURS)
 
 
+@pytest.mark.parametrize("image", [SHADES, COLOURS])
 @pytest.mark.parametrize("orientation", [1, 6, 7])
-def test_deep_colours_are_turned_as_others_are(tmp_path: Path, orientation: int) -> None:
-    shallow = turned(tmp_path / "0.png", COLOURS, orientation)
-    deep = write(tmp_path / "1.png", COLOURS.astype(np.uint16) * 257)
+def test_deep_images_are_turned_as_others_are(tmp_path: Path, orientation: int, image: np.ndarray) -> None:
+    shallow = turned(tmp_path / "0.png", image, orientation)
+    deep = write(tmp_path / "1.png", image.astype(np.uint16) * 257)
     donor, data = shallow.read_bytes(), deep.read_bytes()
     at = donor.index(b"eXIf") - 4
     chunk = donor[at : at + 12 + int.from_bytes(donor[at : at + 4], "big")]
@@ -165,3 +167,15 @@ def test_to_import_cuspid_leaves_the_filters_of_warnings_alone() -> None:
     code += "import cuspid.runtime.image_files, cuspid.model.capture, cuspid.storage; print(warnings.filters == before)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
+
+
+def test_images_of_a_film_are_made_brighter_alike() -> None:
+    """By what all but the brightest tenth of them bear; those of 8 bits, and bright ones, are left as they are."""
+    film = [np.full((20, 20, 3), level, np.float32) for level in [5.0] * 18 + [10.0] + [100.0]]
+    assert common_brightening(film) == pytest.approx(255 / 5)
+    assert common_brightening([*film, *film[-2:]]) < 255 / 5
+    assert common_brightening(as_8_bits(image) for image in film) == 1
+    assert common_brightening([film[0] + 200]) == 1
+    assert common_brightening([]) == 1
+    assert as_8_bits(film[0], 51.0).max() == 255
+    assert as_8_bits(as_8_bits(film[0]), 51.0).max() == 5

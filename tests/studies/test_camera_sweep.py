@@ -44,7 +44,7 @@ def site(coarse_phantom):
 def swept(coarse_phantom, tmp_path_factory):
     """A real sweep of two cases, its folder and its progress."""
     folder, seen = tmp_path_factory.mktemp("sweep"), []
-    outcomes = sweep(coarse_phantom, folder, SMALL, workers=2, progress=lambda *at: seen.append(at))
+    outcomes = sweep(coarse_phantom, folder, SMALL, workers=1, progress=lambda *at: seen.append(at))
     return outcomes, folder, seen
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from statistics import median_low
 from typing import Annotated, Literal
 
 import numpy as np
@@ -200,11 +201,12 @@ def _calibrate_once(
     board: Target,
     options: CalibrationOptions,
 ) -> RigCalibration:
-    few = [name for name in sizes if sum(camera == name for camera, _ in views) < LEAST_VIEWS]
+    times = Counter(camera for camera, _ in views)
+    few = [f"{name} {times[name]}" for name in sizes if times[name] < LEAST_VIEWS]
     if few:
         raise ReconstructionError(
-            f"calibration: {', '.join(few)} saw the board at fewer than {LEAST_VIEWS} instants; check that the "
-            "columns, rows, dictionary and kind of the board match the images"
+            f"calibration: the board must be found at {LEAST_VIEWS} instants or more by each camera, but is at fewer "
+            f"({', '.join(few)}); show it at more, or check that its columns, rows, dictionary and kind are right"
         )
     lenses = {name: _choose_camera_lens(name, views, board, size, options.lens) for name, size in sizes.items()}
     choices = {name: choice for name, (choice, _) in lenses.items()}
@@ -668,6 +670,7 @@ def _timing_notes(checks: Mapping[str, CameraCheck], frames_per_s: float | None)
             "the cameras did not expose together; by the motion of the board, in frames from their mean: "
             f"{', '.join(delays)}; this is taken into account, but a board at rest gives more accurate results"
         )
+        yield from _misnumbered({name: each.delay_frames or 0.0 for name, each in checks.items()})
     readouts = [
         describe(name, check.readout, check.readout_sigma, 3)
         for name, check in checks.items()
@@ -678,6 +681,17 @@ def _timing_notes(checks: Mapping[str, CameraCheck], frames_per_s: float | None)
             "the cameras do not expose all rows at once; by the motion of the board, from the first row to the last, "
             f"as a share of the time between frames: {', '.join(readouts)}; this is taken into account"
         )
+
+
+def _misnumbered(delays_frames: Mapping[str, float]) -> Iterator[str]:
+    """Which cameras began whole frames later, or earlier, than most."""
+    usual = median_low(delays_frames.values())
+    for name, delay in delays_frames.items():
+        if late := round(delay - usual):
+            yield (
+                f"camera {name} began {abs(late)} frame{'s' * (abs(late) > 1)} {'later' if late > 0 else 'earlier'} "
+                f"than most: number its images {abs(late)} {'higher' if late > 0 else 'lower'}"
+            )
 
 
 def _doubt_notes(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:

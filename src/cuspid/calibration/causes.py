@@ -8,11 +8,12 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, Int, UInt8
 
 from cuspid.calibration.circle_centres import recognize_grid
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.lattice import find_lattice
+from cuspid.calibration.marker_layout import Outlines, board_by_markers
 from cuspid.calibration.tag_corners import ABOVE, detect_tags, layout_agreement, tag_beside
 from cuspid.model.board import Board, BoardSet, Target
 from cuspid.runtime.errors import InputError
@@ -76,11 +77,8 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
     if board.has_circles or board.kind == "aprilgrid":
         yield from _other_grids(board, images)
         return
-    for columns, rows, why in (*_visible_sizes(board, images), *_sizes(board)):
-        sized = _possible(board, columns=columns, rows=rows)
-        if sized is not None:
-            yield f"{why}: give --columns {columns} --rows {rows}", sized, False
     if board.kind == "charuco":
+        yield from _by_markers(board, images)
         for dictionary in _DICTIONARIES:
             if dictionary[:3] != board.dictionary[:3]:
                 marked = _possible(board, dictionary=dictionary)
@@ -88,14 +86,16 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
                     yield f"its markers are of another family: give --dictionary {dictionary}", marked, False
         yield "it has no markers: give --kind chessboard", replace(board, kind="chessboard", terraces=1), False
     else:
+        for columns, rows, why in (*_visible_sizes(board, images), *_sizes(board)):
+            sized = _possible(board, columns=columns, rows=rows)
+            if sized is not None:
+                yield f"{why}: give --columns {columns} --rows {rows}", sized, False
         yield "it has markers: give --kind charuco", replace(board, kind="charuco"), False
     yield from _other_grids(board, images)
 
 
 def _visible_sizes(board: Board, images: Sequence[Gray]) -> Iterator[tuple[int, int, str]]:
-    """Numbers of squares of the chessboard that most images show, whatever it is said to be."""
-    if board.kind != "chessboard":
-        return
+    """Numbers of squares of the chessboard that most images show, whatever they are said to be."""
     found = [each.size for each in (find_lattice(image) for image in images) if each is not None]
     if not found:
         return
@@ -114,8 +114,23 @@ def _sizes(board: Board) -> Iterator[tuple[int, int, str]]:
     yield columns + 1, rows + 1, "its corners were counted, not its squares"
     if columns != rows:
         yield rows + 1, columns + 1, "its corners were counted, not its squares, and columns and rows are swapped"
-    if board.kind == "charuco":  # a smaller chessboard is found in any other one
-        yield columns - 1, rows - 1, "it has a square less each way"
+
+
+def _by_markers(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, bool]]:
+    """The ChArUco board whose markers the images show, where it has other numbers of squares."""
+    found = board_by_markers(_markers_seen(images, board), board)
+    if found is None or found == board:
+        return
+    squares = found.columns, found.rows
+    told = (why for columns, rows, why in _sizes(board) if (columns, rows) == squares)
+    why = next(told, f"its markers are those of a board of {squares[0]} x {squares[1]} squares")
+    yield f"{why}: give {_options_of(found, board)}", found, False
+
+
+def _options_of(found: Board, board: Board) -> str:
+    """How the numbers of squares of a ChArUco board are given, and its layout if another one was said."""
+    layout = "" if found.legacy == board.legacy else " --legacy" if found.legacy else " --no-legacy"
+    return f"--columns {found.columns} --rows {found.rows}{layout}"
 
 
 def _possible(board: Board, **changes: object) -> Board | None:
@@ -143,17 +158,27 @@ def _other_first_ids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str
 
 
 def _ids_seen(images: Sequence[Gray], board: Board) -> list[int]:
-    """The ids of the markers of a board's family in some images, in order, but for those that are seen too seldom to be
-    trusted; none where they are few."""
+    """The ids of the markers of a board's family in some images, in order; none where they are few."""
+    ids = sorted(set().union(*_markers_seen(images, board)))
+    return ids if len(ids) >= _FEWEST_MARKERS else []
+
+
+def _markers_seen(images: Sequence[Gray], board: Board) -> list[Outlines]:
+    """By image, the markers of a board's family, but for those that are seen too seldom to be trusted."""
     if board.kind == "aprilgrid":
-        found = [list(detect_tags(_undo_inversion(image, board), board.border_bits)) for image in images]
+        found: list[Outlines] = [detect_tags(_undo_inversion(image, board), board.border_bits) for image in images]
     else:
         detector = cv2.aruco.ArucoDetector(_dictionary(board.family))
-        seen = [detector.detectMarkers(_undo_inversion(image, board))[1] for image in images]
-        found = [each.ravel().tolist() for each in seen if each is not None]
-    counts = Counter(each for ids in found for each in ids)
-    ids = sorted(each for each, count in counts.items() if count >= min(2, len(images)))
-    return ids if len(ids) >= _FEWEST_MARKERS else []
+        found = [_outlines(*detector.detectMarkers(_undo_inversion(image, board))[:2]) for image in images]
+    counts = Counter(number for outlines in found for number in outlines)
+    trusted = {number for number, count in counts.items() if count >= min(2, len(images))}
+    return [{number: each for number, each in outlines.items() if number in trusted} for outlines in found]
+
+
+def _outlines(corners: Sequence[Float32[np.ndarray, "1 4 2"]], ids: Int[np.ndarray, "n 1"] | None) -> Outlines:
+    """What OpenCV's detector has found."""
+    numbers = [] if ids is None else ids.ravel().tolist()
+    return {number: each[0].astype(np.float64) for number, each in zip(numbers, corners, strict=True)}
 
 
 def _undo_inversion(image: Gray, board: Board) -> Gray:
@@ -184,12 +209,15 @@ def _other_markers(images: Sequence[Gray], board: Board) -> str | None:
         *(Board(kind="charuco", dictionary=family, inverted=board.inverted) for family in families),  # type: ignore[arg-type]
         *(Board(kind="aprilgrid", border_bits=bits, inverted=board.inverted) for bits in (2, 1)),
     ):
-        ids = [] if other.family == board.family else _ids_seen(images, other)
+        ids = [] if other.family == board.family and board.has_markers else _ids_seen(images, other)
         if ids:
-            family = f" --dictionary {other.dictionary}" if other.kind == "charuco" else ""
+            charuco = other.kind == "charuco"
+            found = board_by_markers(_markers_seen(images, other), other) if charuco else None
+            family = f" --dictionary {other.dictionary}" if charuco else ""
+            size = f" {_options_of(found, other)}, with" if found else ", with its --columns, --rows and"
             return (
                 f"the images show markers of the family {other.family} (ids {ids[0]}-{ids[-1]}): give --kind "
-                f"{other.kind}{family}, with its --columns, --rows and --square-mm"
+                f"{other.kind}{family}{size} its --square-mm"
             )
     return None
 

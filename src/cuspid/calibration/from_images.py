@@ -20,7 +20,7 @@ from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.rig import Handpiece, depth_of_field_mm
 from cuspid.runtime.errors import ReconstructionError
-from cuspid.runtime.image_files import Pixels, visible_grey
+from cuspid.runtime.image_files import Pixels, full_range_grey
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.values import join_names
 from cuspid.runtime.workers import map_in_threads
@@ -61,6 +61,7 @@ def calibrate(
     Raises ReconstructionError, which names the cause, where a camera hardly saw the board as it was described, and
     InputError where nothing shows which images were taken together.
     """
+    _require_images(images)
     images, named_notes = _match_frames(images)
     views = _views(images, board, progress)
     _require_views(images, views, board)
@@ -76,6 +77,16 @@ def calibrate(
     read = (note for each in images.values() for note in each.notes)
     found = replace(found, notes=(*read, *named_notes, *_missed_board_notes(images, views), *drawn_notes, *found.notes))
     return Calibration(handpiece=_handpiece(found, light, drawn, working_distance_mm), rig=found, light=light)
+
+
+def _require_images(sequences: Mapping[str, ImageSequence]) -> None:
+    """Raise ReconstructionError where a camera cannot be calibrated whatever its images show."""
+    few = [f"{name} {len(each)}" for name, each in sequences.items() if len(each) < LEAST_VIEWS]
+    if few:
+        raise ReconstructionError(
+            f"calibration: images of the board at {LEAST_VIEWS} instants or more are needed of each camera, but there "
+            f"are fewer ({', '.join(few)}); hold it in further places, tilted by 20 to 50 degrees"
+        )
 
 
 def _light(
@@ -123,7 +134,7 @@ def _views(sequences: Mapping[str, ImageSequence], board: Target, progress: Prog
 
     def find(image: tuple[str, int]) -> BoardView | None:
         camera, index = image
-        return find_corners(visible_grey(sequences[camera].fine_image(index)), board)
+        return find_corners(full_range_grey(sequences[camera].fine_image(index)), board)
 
     found = map_in_threads(find, images, stage="corners", progress=progress)
     return {
@@ -173,7 +184,7 @@ def _other_circles(sequences: Mapping[str, ImageSequence], views: Views, board: 
 def _sample_images(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:
     """A few of some images, evenly, in grey."""
     tried = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, MOST_TRIED).astype(int))] if indices else []
-    return [visible_grey(sequence.fine_image(index)) for index in tried]
+    return [full_range_grey(sequence.fine_image(index)) for index in tried]
 
 
 def _missed_board_notes(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[str]:

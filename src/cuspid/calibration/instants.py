@@ -19,7 +19,7 @@ def common_instants(names: Mapping[str, Sequence[str]]) -> Mapping[str, tuple[st
     """
     if len(names) < 2 or _share_instants(names):
         return None
-    numbers = {camera: _numbers(each) for camera, each in names.items()}
+    numbers = {camera: numbers_in(each) for camera, each in names.items()}
     if any(each is None for each in numbers.values()) or not _share_instants(numbers):
         shown = ", ".join(f"{camera}: {each[0]}" for camera, each in names.items() if each)
         raise InputError(
@@ -38,7 +38,7 @@ def _share_instants(names: Mapping[str, Sequence[object] | None]) -> bool:
     return len(set().union(*seen)) < sum(map(len, seen))
 
 
-def _numbers(names: Sequence[str]) -> list[tuple[int, ...]] | None:
+def numbers_in(names: Sequence[str]) -> list[tuple[int, ...]] | None:
     """Of each name the numbers that change from image to image; None if they do not tell the images apart."""
     found = [tuple(map(int, _DIGITS.findall(name))) for name in names]
     if not found or len({len(each) for each in found}) > 1:

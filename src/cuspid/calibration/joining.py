@@ -18,7 +18,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.calibration.agreement import consensus_motion
+from cuspid.calibration.agreement import consensus_motion, disagreement_between
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.corners import BoardView, Views, split_by_board
 from cuspid.calibration.start import board_pose
@@ -154,9 +154,14 @@ def _join_two_groups(groups: _Groups, seen: Sequence[_Seen]) -> _Groups | None:
     side = 0 if kind == "cameras" else 1
     candidates = _estimate_hand_eye(poses, one, other, side)
     away = [pose.translation for each in poses.values() for pose in each.values()]
-    best, agreeing = consensus_motion([[each] for each in candidates], float(np.median(np.linalg.norm(away, axis=1))))
+    distance_mm = float(np.median(np.linalg.norm(away, axis=1)))
+    best, agreeing, _ = consensus_motion([[each] for each in candidates], distance_mm)
     if 2 * agreeing < len(candidates):
-        raise ReconstructionError(_disagreement(groups, kind, one, other, agreeing, len(candidates)))
+        if kind == "boards":
+            raise ReconstructionError(_disagreement(groups, one, other, agreeing, len(candidates)))
+        named = ", ".join(groups.cameras_of(other)), ", ".join(groups.cameras_of(one))
+        own = _poses_to_compare(poses, other, one)
+        raise ReconstructionError(disagreement_between(named, own, agreeing, len(candidates), distance_mm))
     return groups.merge_cameras(one, other, best) if side == 0 else groups.merge_boards(one, other, best)
 
 
@@ -176,13 +181,17 @@ def _estimate_hand_eye(
     return candidates
 
 
-def _disagreement(groups: _Groups, kind: str, one: int, other: int, agreeing: int, count: int) -> str:
-    if kind == "cameras":
-        first, second = (", ".join(groups.cameras_of(each)) for each in (one, other))
-        return (
-            f"calibration: only {agreeing} of {count} instants agree on the pose of {second} relative to {first}; "
-            "check that they were triggered together, and that images with the same name belong together"
-        )
+def _poses_to_compare(
+    poses: Mapping[tuple[int, int], Mapping[str, Rigid3]], one: int, other: int
+) -> tuple[dict[str, list[Rigid3]], dict[str, list[Rigid3]]]:
+    """The poses, by instant, of the boards that both of two groups of cameras saw most often."""
+    boards = [board for group, board in poses if group == one and (other, board) in poses]
+    most = max(boards, key=lambda board: min(len(poses[one, board]), len(poses[other, board])))
+    first, second = ({instant: [pose] for instant, pose in poses[each, most].items()} for each in (one, other))
+    return first, second
+
+
+def _disagreement(groups: _Groups, one: int, other: int, agreeing: int, count: int) -> str:
     first, second = (_numbers(groups.boards_of(each)) for each in (one, other))
     return (
         f"calibration: only {agreeing} of {count} instants agree on where {second} is relative to {first}; the boards "

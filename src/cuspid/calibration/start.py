@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.calibration.agreement import consensus_motion, motion_difference
+from cuspid.calibration.agreement import consensus_motion, disagreement_between, motion_difference
 from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, select_instants, views_in_front
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, pieces
 from cuspid.geometry import Rigid3, best_similarity
@@ -224,10 +224,13 @@ def _average_relative_pose(poses: Poses, known: str, new: str, instants: Sequenc
     """
     candidates = [[pose @ poses[known, instant][0].inverse() for pose in poses[new, instant]] for instant in instants]
     distance_mm = float(np.median([np.linalg.norm(poses[new, instant][0].translation) for instant in instants]))
-    best, agreeing = consensus_motion(candidates, distance_mm)
+    best, agreeing, _ = consensus_motion(candidates, distance_mm)
     if 2 * agreeing < len(instants):
-        raise ReconstructionError(
-            f"calibration: only {agreeing} of {len(instants)} instants agree on the pose of {new} relative to "
-            f"{known}; check that they were triggered together, and that images with the same name belong together"
-        )
+        own = _poses_of(poses, new), _poses_of(poses, known)
+        raise ReconstructionError(disagreement_between((new, known), own, agreeing, len(instants), distance_mm))
     return best
+
+
+def _poses_of(poses: Poses, name: str) -> dict[str, Sequence[Rigid3]]:
+    """By instant, of one camera."""
+    return {instant: each for (camera, instant), each in poses.items() if camera == name}

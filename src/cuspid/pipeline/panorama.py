@@ -47,7 +47,7 @@ from cuspid.motion.rig_film import (
     trajectory_of_camera,
 )
 from cuspid.runtime.errors import InputError, ReconstructionError
-from cuspid.runtime.image_files import as_8_bits
+from cuspid.runtime.image_files import as_8_bits, common_brightening
 from cuspid.runtime.plugins import load_plugin
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import computed_once
@@ -81,6 +81,8 @@ _NOT_ON_SURFACE = "motion: the path is less accurate, for too few points are fou
 
 _LEAST_COVERED = 0.01
 """Share of a picture that shows something, at least; a narrow arch fills a tenth of it."""
+_METERED = 40
+"""Images of a film whose brightness is looked at."""
 _ENOUGH_SHARED = 50
 """Points that frames which overlap by half share many times over."""
 _SLIDING_PCT = 0.06
@@ -121,8 +123,9 @@ def stitch(
         panoramas = method(frames, examination=options.examination, progress=progress)
         return require_content(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(frames, options.motion, progress=progress)
-    notes = (*frames.notes, *motion.notes)
-    stitched = [_stitch_part(frames, motion, number, options, progress) for number in range(len(motion.parts))]
+    brighter = common_brightening(map(frames.fine_image, range(len(frames))[_metered(len(frames))]))
+    notes = (*frames.notes, *motion.notes, *_brightness_notes(brighter))
+    stitched = [_stitch_part(frames, motion, k, brighter, options, progress) for k in range(len(motion.parts))]
     return require_content(
         replace(
             part,
@@ -153,15 +156,31 @@ def _median_shared_points(motion: SparseModel) -> float:
     return float(np.median([len(before & after) for before, after in pairwise(seen)] or [0]))
 
 
+def _metered(images: int) -> slice:
+    """Those of a film whose brightness is looked at."""
+    return slice(None, None, max(1, images // _METERED))
+
+
+def _brightness_notes(brighter: float) -> Iterator[str]:
+    if brighter > 1:
+        yield f"the images are dark, and have more than 8 bits: they are shown {brighter:.1f} times brighter"
+
+
 def _stitch_part(
-    sequence: ImageSequence, motion: SingleMotion, number: int, options: StitchOptions, progress: Progress
+    sequence: ImageSequence,
+    motion: SingleMotion,
+    number: int,
+    brighter: float,
+    options: StitchOptions,
+    progress: Progress,
 ) -> Stitched:
-    """The panorama of a part of the motion, whose path is made more precise on the surface that it shows."""
+    """The panorama of a part of the motion, whose path is made more precise on the surface that it shows, from images
+    that are so many times brighter."""
     index = {name: each for each, name in enumerate(sequence.names)}
     located, notes = motion.parts[number], tuple[str, ...]()
 
     def read(name: str) -> UInt8[np.ndarray, "h w 3"]:
-        return sequence.image(index[name])
+        return as_8_bits(sequence.fine_image(index[name]), brighter)
 
     shown = find_surface(located, read, options, working_distance_mm=sequence.working_distance_mm, progress=progress)
     if options.motion.on_surface and shown.dense is not None:
@@ -201,7 +220,7 @@ def stitch_rig(capture: Capture, options: StitchOptions = StitchOptions(), *, pr
             shown = scene.surface(progress, before=shown)
     uses = _uses(capture, scene.found, scene.camera)
     made = orthophoto(shown, uses, scene.read, options, progress=progress)
-    noted = (*_scale_notes(scene.found, scene.camera), *scene.found.notes, *notes)
+    noted = (*_scale_notes(scene.found, scene.camera), *scene.found.notes, *_brightness_notes(scene.brighter), *notes)
     return require_content([replace(made, panorama=replace(made.panorama, notes=noted))])[0]
 
 
@@ -224,10 +243,16 @@ class _RigScene:
         has = {frame.name for frame in self.capture.frames if self.camera in frame.cameras}
         return trajectory_of_camera(self.found, self.camera, has)
 
+    @computed_once
+    def brighter(self) -> float:
+        """How many times brighter the images are shown and compared."""
+        taken = [(frame.name, camera) for frame in self.capture.frames for camera in frame.cameras]
+        return common_brightening(self.capture.source.read(*image) for image in taken[_metered(len(taken))])
+
     def read(self, name: str) -> UInt8[np.ndarray, "h w 3"]:
         """The image ``camera/frame``, or that of a frame and the camera whose picture it is."""
         one, _, frame = name.rpartition("/")
-        return as_8_bits(self.capture.source.read(frame, one or self.camera))
+        return as_8_bits(self.capture.source.read(frame, one or self.camera), self.brighter)
 
     def surface(self, progress: Progress, before: Shown | None = None) -> Shown:
         """What cameras of one instant agree on; near what they showed ``before``."""

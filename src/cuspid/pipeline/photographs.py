@@ -34,7 +34,7 @@ from cuspid.motion.monocular.scale import (
     scale_by_distances,
 )
 from cuspid.runtime.errors import InputError
-from cuspid.runtime.image_files import visible_grey
+from cuspid.runtime.image_files import full_range_grey
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import map_in_threads
 from cuspid.storage.reconstructions import RECONSTRUCTION_FILES
@@ -162,7 +162,7 @@ def _sightings(photographs: Photographs, board: Board, progress: Progress) -> li
             image = photographs.read(name, "")
         except InputError:  # it is among the dropped
             return None
-        view = find_corners(visible_grey(image), board)
+        view = find_corners(full_range_grey(image), board)
         return None if view is None else BoardSighting(frame=name, corner=view.corner, pixels=view.pixels)
 
     found = map_in_threads(find, photographs.names, stage="board", progress=progress)

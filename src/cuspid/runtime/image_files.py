@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -38,6 +38,8 @@ _PIXELS = (b"IHDR", b"IDAT", b"IEND")
 _LARGEST = 65535
 _DARK_DN, _BRIGHT_PERCENTILES = 128.0, (99.5, 99.9)
 """An image is dark if the second percentile is below this grey level; it is stretched until the first one is white."""
+_CLIPPED_SHARE = 0.1
+"""Share of the images of a film that are clipped where all are made brighter alike."""
 _FULL, _FEWER_BITS = 16, (8, 10, 12)
 """Bits of what is stored in 16: with more than twelve, the upper eight show what there is."""
 
@@ -60,9 +62,12 @@ def read_fine(path: Path, *, upright: bool = True) -> Pixels:
         return _as_8_bit(image, "RGB", upright=upright)
 
 
-def as_8_bits(image: UInt8[np.ndarray, "*s"] | Float32[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s"]:
-    """The upper 8 bits of what :func:`read_fine` reads; black and white are the ends of what was stretched."""
-    return image if image.dtype == np.uint8 else np.clip(image, 0, 255).astype(np.uint8)
+def as_8_bits(
+    image: UInt8[np.ndarray, "*s"] | Float32[np.ndarray, "*s"], brighter: float = 1.0
+) -> UInt8[np.ndarray, "*s"]:
+    """The upper 8 bits of what :func:`read_fine` reads, or of more bits those of an image so many times brighter; black
+    and white are the ends of what was stretched."""
+    return image if image.dtype == np.uint8 else np.clip(image * np.float32(brighter), 0, 255).astype(np.uint8)
 
 
 def visible_in_8_bits(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
@@ -73,6 +78,14 @@ def visible_in_8_bits(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"
 def visible_grey(image: Pixels) -> UInt8[np.ndarray, "h w"]:
     """An RGB image in grey, as :func:`visible_in_8_bits`."""
     return visible_in_8_bits(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
+
+
+def full_range_grey(image: Pixels) -> UInt8[np.ndarray, "h w"]:
+    """An RGB image in grey; of more than 8 bits with the whole range of 8, however bright it is: where the corners of a
+    chessboard are found depends on the contrast, by up to 0.3 px."""
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    bright = 0.0 if grey.dtype == np.uint8 else float(np.percentile(grey[::2, ::2], _BRIGHT_PERCENTILES[0]))
+    return np.asarray(cv2.convertScaleAbs(grey, alpha=255 / bright), np.uint8) if bright > 0 else as_8_bits(grey)
 
 
 def brighten(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
@@ -87,6 +100,14 @@ def stretch_fine(
     """A dark image of more than 8 bits as bright as :func:`brighten` makes it, unrounded and unclipped; others as they
     are."""
     return grey if grey.dtype == np.uint8 else grey * np.float32(_brightness_factor(grey))
+
+
+def common_brightening(images: Iterable[Pixels]) -> float:
+    """How many times brighter images of one film can be, which are compared with each other: as :func:`brighten` makes
+    all but the brightest tenth of them, if they have more than 8 bits."""
+    greys = (np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in images)
+    factors = [1.0 if grey.dtype == np.uint8 else _brightness_factor(grey) for grey in greys]
+    return float(np.quantile(factors, _CLIPPED_SHARE, method="higher")) if factors else 1.0
 
 
 def _brightness_factor(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> float:
