@@ -21,8 +21,8 @@ at ("commit 1234567") or the test that holds it ("tests/room/test_it.py"), or th
 
     <!-- given -->
 
-which says that the figures of its block, or of the section whose heading stands below it, are options, definitions,
-arithmetic or other people's.
+on a line of its own or after some words, which says that the figures of its block, or of the section whose heading
+stands below it, are options, definitions, arithmetic or other people's.
 """
 
 from __future__ import annotations
@@ -55,7 +55,10 @@ UNIT = r"(?:µm|um|%|per mille|s|CPU-s|min|minutes|ppm|GiB)(?![\w/²])"
 MEASURED = re.compile(rf"\d[\d.,]*\s+{UNIT}|\d+\.\d+\s+px")  # whole pixels are sizes of images and windows
 DATED = re.compile(r"\bcommits?\s+[0-9a-f]{7}|\btests/\w+/test_\w+\.py")
 GIVEN = "<!-- given -->"
-NO_PROSE = re.compile(r"^ *```.*?^ *```$|^\$\$.*?^\$\$|<!-- (?!given).*?-->|`[^`]*`", re.MULTILINE | re.DOTALL)
+SWALLOWS = rf"^ *(?:[-*] )?{GIVEN}(?= *\S)"  # a comment that begins a line makes what follows it there HTML
+NO_PROSE = re.compile(
+    rf"^ *```.*?^ *```$|^\$\$.*?^\$\$|{SWALLOWS}|<!-- (?!given).*?-->|`[^`]*`", re.MULTILINE | re.DOTALL
+)
 
 Results = Mapping[str, Any]
 """What the files of results hold, by their names."""

@@ -334,6 +334,7 @@ def test_what_a_source_says(freshness, source, told):
         ("a 1;\n\n| b | s |\n|---|---|\n| c | 3 |\n", {}, "| b | s | |---|---|"),
         ("a 1;\n<!-- given -->\n## B\n3 s\n### C\n4 s\n## D\n5 s\n", {}, "5 s (5 s): measured"),
         ("a 1;\n<!-- given -->\n3 s\n\n4 s\n", {}, "4 s (4 s): measured"),
+        ("a 1;\n\n<!-- given --> 3 s\n", {}, "3 s (3 s): measured"),
     ],
 )
 def test_a_figure_without_a_result_is_refused(freshness, page, changed, said):
