@@ -596,6 +596,7 @@ def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
     assert {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()} == before
 
 
+@pytest.mark.long
 def test_a_dark_board_of_16_bits_has_the_corners_of_a_bright_one(tmp_path):
     """Of which 8 bits would leave 16 levels of grey."""
     board = Board(columns=8, rows=8, square_mm=2.0)

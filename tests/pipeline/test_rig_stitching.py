@@ -15,12 +15,12 @@ from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.model.arch_curve import arch_curve
 from cuspid.model.capture import Capture, Frame
 from cuspid.model.jaw import Jaw
-from cuspid.model.reconstruction import Reconstruction, Tracks
+from cuspid.model.reconstruction import Expectation, Reconstruction, Tracks
 from cuspid.model.trueness import GroundTruth
 from cuspid.motion.bundle.adjustment import AdjustmentOptions
 from cuspid.motion.monocular.single import SingleOptions
 from cuspid.motion.rig_film import film_options, locate_rig_film, of_camera, refine_rig_on_surface, surface_patches
-from cuspid.pipeline.panorama import StitchOptions, stitch_rig
+from cuspid.pipeline.panorama import StitchOptions, _scale_notes, stitch_rig
 from cuspid.pipeline.scan import RenderOptions, take_images
 from cuspid.stitching.compared import camera_gains, cameras_beside
 from panoramas import seen_points
@@ -175,6 +175,16 @@ def test_a_frame_that_lacks_an_image_is_left_out_where_it_is_missing(coarse_phan
     model = of_camera(found, "left", with_left)
     assert list(model.frames) == [frame.name for frame in frames if frame.name in with_left]
     assert [model.frames[k] for k in model.tracks.frame_index] == [frames[3].name, frames[6].name]
+
+
+def test_a_note_says_where_the_scale_is_from_and_how_well_it_is_known() -> None:
+    """Where points tell of it: to 0.1 %, and the 0.06 % by which the points of bare teeth slide."""
+    found = Reconstruction(rig=PAIR.rig, rig_from_world={"0": Rigid3.identity()})
+    point = {"points": np.zeros((1, 3)), "covariance": np.zeros((1, 3, 3))}
+    told = Expectation(**point, scale_sigma_ppm=1000.0, span_mm=9.0, span_sigma_um=9.0)
+    (known,), (unknown,) = (_scale_notes(each, "left") for each in (replace(found, expectation=told), found))
+    assert known == unknown.replace(";", ", known to within 0.12 % (one sigma);")
+    assert "of the handpiece; the picture is that of camera left" in unknown
 
 
 def test_gains_are_those_of_the_cameras() -> None:
