@@ -91,37 +91,37 @@ _PAPILLA_BELOW_MM = 1.0
 
 SIGMA_MM: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
-        "canine.cusp_tip": (0.08, 0.07),
-        "canine.distal_angle": (0.31, 0.68),
+        "canine.cusp_tip": (0.09, 0.06),
+        "canine.distal_angle": (0.30, 0.68),
         "canine.labial_cervix": (0.12, 0.06),
         "canine.lingual_cervix": (0.13, 0.00),
-        "canine.mesial_angle": (0.21, 0.37),
+        "canine.mesial_angle": (0.20, 0.38),
         "incisor.distal_angle": (0.22, 0.26),
-        "incisor.incisal_edge": (0.08, 0.16),
+        "incisor.incisal_edge": (0.08, 0.15),
         "incisor.labial_cervix": (0.10, 0.08),
         "incisor.lingual_cervix": (0.11, 0.06),
         "incisor.mesial_angle": (0.13, 0.21),
-        "midline": (0.00, 0.23),
+        "midline": (0.00, 0.22),
         "molar.buccal_groove": (0.04, 0.07),
-        "molar.central_groove": (0.16, 0.07),
-        "molar.distobuccal_cusp": (0.16, 0.03),
-        "molar.mesiobuccal_cusp": (0.14, 0.05),
-        "molar.mesiolingual_cusp": (0.13, 0.05),
+        "molar.central_groove": (0.15, 0.04),
+        "molar.distobuccal_cusp": (0.13, 0.00),
+        "molar.mesiobuccal_cusp": (0.14, 0.03),
+        "molar.mesiolingual_cusp": (0.14, 0.00),
         "papilla": (0.00, 0.24),
         "premolar.buccal_cervix": (0.08, 0.06),
-        "premolar.buccal_cusp": (0.03, 0.04),
-        "premolar.central_groove": (0.14, 0.07),
+        "premolar.buccal_cusp": (0.06, 0.04),
+        "premolar.central_groove": (0.19, 0.00),
         "premolar.lingual_cervix": (0.10, 0.06),
-        "premolar.lingual_cusp": (0.18, 0.00),
+        "premolar.lingual_cusp": (0.04, 0.08),
     }
 )
 """Standard uncertainty (one axis) of each kind of point: a constant in mm, and a share of the edge length of the mesh.
 
 From the errors on phantoms of seeds 100 to 113, both arches, with edges of 0.5 and 0.9 mm: what the spread under tilts
 and smoothing does not explain (`python benchmarks/landmarks.py --calibrate`)."""
-REAL_TEETH_MM = 0.26
+REAL_TEETH_MM = 0.28
 """Standard uncertainty (one axis) that real teeth, of other forms than the phantom's, worn and restored, and people's
-judgement of where a point is add to those: from 101 points that people set on three arches
+judgement of where a point is add to those: from 133 points that people set on four arches
 (``benchmarks/landmarks.py``, `DEVELOPED_ON`)."""
 
 
