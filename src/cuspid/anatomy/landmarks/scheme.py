@@ -61,7 +61,7 @@ _TIP_LEANS_DEG: Mapping[Arch, Mapping[str, tuple[float, float]]] = MappingProxyT
             "lingual_cusp": (-5.0, 30.0),
             "second_lingual_cusp": (5.0, 30.0),
             "mesiobuccal_cusp": (-10.0, 10.0),
-            "distobuccal_cusp": (0.0, 5.0),
+            "distobuccal_cusp": (10.0, 10.0),
             "distal_buccal_cusp": (10.0, 10.0),
             "mesiolingual_cusp": (-20.0, 30.0),
             "distolingual_cusp": (20.0, 30.0),
@@ -71,8 +71,8 @@ _TIP_LEANS_DEG: Mapping[Arch, Mapping[str, tuple[float, float]]] = MappingProxyT
 """Lean in degrees, distal and outwards (buccal or lingual), of the direction in which the tip of a cusp is the farthest
 point: of a top that is worn flat, the corner where its ridges met.
 
-Lingual cusps of lower teeth meet others on their inner side alone, and are worn there. The distobuccal cusp of a lower
-molar is the middle one of its row. From points that people set on four arches (``benchmarks/landmarks.py``)."""
+Lingual cusps of lower teeth meet others on their inner side alone, and are worn there. From points that people set on
+four arches (``benchmarks/landmarks.py``)."""
 
 MIDLINE_LANDMARKS = ("papilla", "midline")
 """``papilla``: centre of the incisive papilla (upper), tip of the lingual papilla between the central incisors (lower).
