@@ -4,12 +4,12 @@
                                  [--work FOLDER] [--out benchmarks/results/rolling.json]
 
 Cameras film a board that a hand moves, each with a readout of its own (``simulated``): the errors of the readouts,
-delays and lenses in what is stated, and those of the lenses if the readouts are ignored. The same with webcams (``FOLDER``,
-with ``caliscope/``): residuals in held-out images without and with readouts. The molar 46 of the phantom is scanned by
-twelve cameras (``scans``) with global shutters, and with rolling ones that are known, ignored or unknown, together and
-delayed. Finished scans are kept in the work folder, and what the same code has measured in the file of results; neither
-is made again. ``--add`` keeps what older code has measured, too: the commit of the file stays that of these, and films
-have one of their own.
+delays and lenses in what is stated, and those of the lenses if the readouts are ignored. The same with webcams
+(``FOLDER``, with ``caliscope/``): residuals in held-out images without and with readouts. The molar 46 of the phantom
+is scanned by twelve cameras (``scans``) with global shutters, and with rolling ones that are known, ignored or unknown,
+together and delayed. Finished scans are kept in the work folder, and what the same code has measured in the file of
+results; neither is made again. ``--add`` keeps what older code has measured, too: the commit of the file stays that of
+these, and films have one of their own.
 """
 
 from __future__ import annotations

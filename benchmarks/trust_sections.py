@@ -324,8 +324,8 @@ def rolling(result: Result) -> str:
         [
             f"Cameras film a board that a hand moves over 28 frames ({result['noise_px']} px of noise; readouts "
             f"{readouts} of the time between frames; *late*: one exposes 0.4 frames after the others; *all apart*: "
-            "one 0.4 frames after the first, another 0.3 before it; *global*: readouts of 0). Errors are root mean squares, in stated standard deviations where it says so (bar: 0.8 to "
-            "1.2):",
+            "one 0.4 frames after the first, another 0.3 before it; *global*: readouts of 0). Errors are root mean "
+            "squares, in stated standard deviations where it says so (bar: 0.8 to 1.2):",
             "",
             markdown_table(
                 (
