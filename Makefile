@@ -19,9 +19,9 @@ demo: $(STAMP)
 test: $(STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile -m "not documentation and not long"
 
-# With the long closed loops, those of Blender and of a browser, and all of the fuzzer's scenarios.
+# With the long closed loops, those of Blender and of a browser, all of the fuzzer's scenarios, and more examples of laws.
 test-all: $(STAMP)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile -m "not documentation"
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile -m "not documentation" --hypothesis-profile all
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

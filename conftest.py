@@ -1,14 +1,16 @@
-"""Values that are costly to make, once for each worker.
+"""Values that are costly to make, once for each worker, or once for all of them.
 
 The package is imported where it is needed: the process that only hands out the tests reads this file, too.
 """
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 
 import shape_checks
@@ -18,8 +20,9 @@ if TYPE_CHECKING:
     from cuspid.model.mesh import Mesh
 
 # Machines differ in speed, and a test says nothing about it.
-settings.register_profile("cuspid", deadline=None)
-settings.load_profile("cuspid")
+settings.register_profile("quick", deadline=None, max_examples=40)
+settings.register_profile("all", deadline=None, max_examples=100)  # what `make test-all` asks for
+settings.load_profile("quick")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -29,12 +32,18 @@ def shapes_are_checked() -> None:
 
 
 @pytest.fixture(scope="session")
-def coarse_phantom() -> Jaw:
-    """The built-in lower jaw with coarse faces."""
+def coarse_phantom(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Jaw:
+    """The built-in lower jaw with coarse faces, which the first worker that needs it builds for all."""
     from cuspid.anatomy.phantom.build import build_phantom
     from cuspid.anatomy.phantom.options import PhantomOptions
 
-    return build_phantom(PhantomOptions(edge_mm=0.5))
+    own = tmp_path_factory.getbasetemp()
+    file = (own if worker_id == "master" else own.parent) / "coarse_phantom.pickle"
+    with FileLock(f"{file}.lock"):
+        if not file.exists():
+            file.write_bytes(pickle.dumps(build_phantom(PhantomOptions(edge_mm=0.5))))
+    jaw: Jaw = pickle.loads(file.read_bytes())
+    return jaw
 
 
 @pytest.fixture(scope="session")

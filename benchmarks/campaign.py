@@ -74,6 +74,7 @@ BENCHMARKS = (
     Benchmark("fuzz", "fuzz.py --out {out}"),
     Benchmark("kill", "kill.py --work {work} --out {out}"),
     Benchmark("large", "large.py --work {work} --out {out}"),
+    Benchmark("mutation", "mutation.py --work {work} --out {out}"),
     Benchmark("precision", "precision.py --pictures {work} --out {out}"),
     Benchmark("visibility", "visibility.py --out {out}"),
     Benchmark("mouth", "mouth.py --out {out}"),

@@ -89,6 +89,7 @@ MAKERS: Mapping[str, Maker] = {
     "grid": Maker("grid"),
     "study": Maker("study", ("study",)),
     "fuzz": Maker("fuzz", ("*",), plain=True, release=True),
+    "mutation": Maker("mutation", ("*",), plain=True),
     "kill": Maker("kill", ("*",), plain=True, release=True),
     "large": Maker("large", ("*",), plain=True, release=True),
     "panorama/*": Maker("panorama", ("film", "panorama", "panorama_evaluation")),

@@ -205,6 +205,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Result], str]]] = {
     "live": ("While scanning", trust_sections.live),
     "fuzz": ("Damaged input", trust_sections.fuzz),
     "kill": ("Killed runs", trust_sections.kill),
+    "mutation": ("What quick tests catch", trust_sections.mutation),
     "large": ("A mesh of 5 million faces", trust_sections.large),
 }
 """Title and text for each file of results that is not of scans, by its stem."""

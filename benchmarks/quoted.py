@@ -6,10 +6,23 @@ Puts the figures of today's results into the pages; with ``--check`` it only say
 documentation does. A text of quoted.toml stands on its page with a figure in place of each ``{}``, and is followed by
 where each is from:
 
-    NAMES: PATH [& NAMES: PATH ...] FORMAT [median|rms|max] [* FACTOR]     a figure, "20-22" where there are several
-    NAMES: PATH <= LIMIT [and NAMES: PATH >= LIMIT ...]                    "met" or "missed", by the size of each value
+    NAMES: PATH [& NAMES: PATH ...] FORMAT [min|max|mean|median|rms|sd] [* FACTOR]
+                                                           a figure, "20-22" where there are several; without its sign
+                                                           unless FORMAT has one
+    NAMES: PATH [& NAMES: PATH ...] <= LIMIT count         how many values keep it, by their size
+    NAMES: PATH <= LIMIT [and NAMES: PATH >= LIMIT ...]    "met" or "missed", by the size of each value
 
-Names of results and the parts of a path may have wildcards. A table with a quoted text has no other figures.
+Names of results and the parts of a path may have wildcards. A part ``KEY=VALUE`` keeps what has this value; a
+number takes this entry of a list, or this word of a text.
+
+A table with a quoted text has no other figures. What else looks measured on a page of quoted.toml (12 µm, 5 %, 3 s)
+stands in a block (a paragraph, a list item, or a table with what stands above it) that names the commit it was measured
+at ("commit 1234567") or the test that holds it ("tests/room/test_it.py"), or that has the comment
+
+    <!-- given -->
+
+on a line of its own or after some words, which says that the figures of its block, or of the section whose heading
+stands below it, are options, definitions, arithmetic or other people's.
 """
 
 from __future__ import annotations
@@ -21,19 +34,31 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean, median, stdev
 from typing import Any
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 
-FIGURE = re.compile(r"(?P<where>.+?) (?P<digits>\.\df)(?: (?P<one>\w+))?(?: \* (?P<factor>\S+))?")
+FIGURE = re.compile(r"(?P<where>.+?) (?P<digits>\+?,?\.\d[ef])(?: (?P<one>\w+))?(?: \* (?P<factor>\S+))?")
 BAR = re.compile(r"(?P<where>.+) (?P<sign>[<>])= (?P<limit>\S+)")
 ONE: Mapping[str, Callable[[Sequence[float]], float]] = {
-    "median": median,
+    "min": min,
     "max": max,
+    "mean": fmean,
+    "median": median,
     "rms": lambda values: fmean([each**2 for each in values]) ** 0.5,
+    "sd": stdev,
 }
+
+UNIT = r"(?:µm|um|%|per mille|s|CPU-s|min|minutes|ppm|GiB)(?![\w/²])"
+MEASURED = re.compile(rf"\d[\d.,]*\s+{UNIT}|\d+\.\d+\s+px")  # whole pixels are sizes of images and windows
+DATED = re.compile(r"\bcommits?\s+[0-9a-f]{7}|\btests/\w+/test_\w+\.py")
+GIVEN = "<!-- given -->"
+SWALLOWS = rf"^ *(?:[-*] )?{GIVEN}(?= *\S)"  # a comment that begins a line makes what follows it there HTML
+NO_PROSE = re.compile(
+    rf"^ *```.*?^ *```$|^\$\$.*?^\$\$|{SWALLOWS}|<!-- (?!given).*?-->|`[^`]*`", re.MULTILINE | re.DOTALL
+)
 
 Results = Mapping[str, Any]
 """What the files of results hold, by their names."""
@@ -49,7 +74,7 @@ def with_figures(page: str, quoted: Quoted, results: Results) -> str:
     """A page with the figures of the results.
 
     Raises:
-        WrongFigureError: A text is not on the page, a figure has no result, or a row of a table is not quoted.
+        WrongFigureError: A text is not on the page, a figure has no result, or one on the page has no source.
     """
     wrong = []
     for text, sources in quoted.items():
@@ -66,6 +91,7 @@ def with_figures(page: str, quoted: Quoted, results: Results) -> str:
         for number, each in reversed(list(enumerate(told, start=1))):
             page = page[: place.start(number)] + each + page[place.end(number) :]
     wrong += [f"{row}: not in quoted.toml" for row in _rows_of_other_origin(page, quoted)]
+    wrong += [f"{block}: measured, but neither quoted nor dated nor given" for block in _without_source(page, quoted)]
     if wrong:
         raise WrongFigureError("\n".join(wrong))
     return page
@@ -74,31 +100,40 @@ def with_figures(page: str, quoted: Quoted, results: Results) -> str:
 def _pattern(text: str) -> re.Pattern[str]:
     """A text wherever its lines are broken, a group for each figure."""
     pieces = [r"\s+".join(re.escape(word) for word in re.split(r"\s+", piece)) for piece in text.split("{}")]
-    return re.compile(r"(\S+?)".join(pieces))
+    return re.compile(r"(\S+?)".join(pieces) + r"(?!\d)")
+
+
+def _any_of(quoted: Quoted) -> re.Pattern[str]:
+    return re.compile("|".join(_pattern(text).pattern for text in quoted) or "(?!)")
 
 
 def _told(source: str, results: Results) -> str:
     """A figure, or whether bars are met."""
     if found := FIGURE.fullmatch(source):
-        values = [value * float(found["factor"] or 1) for value in _values(found["where"], results)]
+        signed = [value * float(found["factor"] or 1) for value in _values(found["where"], results)]
+        values = signed if found["digits"].startswith("+") else [abs(value) for value in signed]
         ends = [ONE[found["one"]](values)] if found["one"] else [min(values), max(values)]
         return "-".join(dict.fromkeys(f"{end:{found['digits']}}" for end in ends))
-    bars = [BAR.fullmatch(each) for each in source.split(" and ")]
-    return "met" if all(_is_met(bar, source, results) for bar in bars) else "missed"
+    kept = [_kept(bar, results) for bar in source.removesuffix(" count").split(" and ")]
+    if source.endswith(" count"):
+        return str(sum(kept[0]))
+    return "met" if all(all(each) for each in kept) else "missed"
 
 
-def _is_met(bar: re.Match[str] | None, source: str, results: Results) -> bool:
+def _kept(source: str, results: Results) -> list[bool]:
+    """Whether each value keeps a bar."""
+    bar = BAR.fullmatch(source)
     if bar is None:
         raise WrongFigureError(f"{source} is neither a figure nor a bar")
-    values, limit = _values(bar["where"], results), float(bar["limit"])
-    return max(values) <= limit if bar["sign"] == "<" else min(values) >= limit
+    sizes, limit = [abs(value) for value in _values(bar["where"], results)], float(bar["limit"])
+    return [size <= limit if bar["sign"] == "<" else size >= limit for size in sizes]
 
 
 def _values(where: str, results: Results) -> list[float]:
-    """Sizes of the figures on paths through the results of some names."""
+    """Figures on paths through the results of some names."""
     places = [place.split(": ") for place in where.split(" & ")]
     found = [
-        abs(float(value))
+        value
         for names, path in places
         for name, result in results.items()
         if fnmatchcase(name, names)
@@ -109,12 +144,21 @@ def _values(where: str, results: Results) -> list[float]:
     return found
 
 
-def _followed(value: Any, path: Sequence[str]) -> Iterator[Any]:
-    if not path:
-        yield from () if value is None else (value,)
+def _followed(value: Any, path: Sequence[str]) -> Iterator[float]:
+    """The numbers at the end of a path."""
+    if not path and isinstance(value, int | float):
+        yield float(value)
+    elif isinstance(value, str) and path and path[0].isdigit():
+        yield from _followed([float(word) for word in value.split()], path)
+    elif isinstance(value, list) and path and path[0].isdigit():
+        yield from _followed(value[int(path[0])], path[1:])
     elif isinstance(value, list):
         yield from (end for each in value for end in _followed(each, path))
-    elif isinstance(value, Mapping):
+    elif isinstance(value, Mapping) and path and "=" in path[0]:
+        key, _, kept = path[0].partition("=")
+        if fnmatchcase(str(value.get(key)), kept):
+            yield from _followed(value, path[1:])
+    elif isinstance(value, Mapping) and path:
         for key in value:
             if fnmatchcase(key, path[0]):
                 yield from _followed(value[key], path[1:])
@@ -123,9 +167,35 @@ def _followed(value: Any, path: Sequence[str]) -> Iterator[Any]:
 def _rows_of_other_origin(page: str, quoted: Quoted) -> list[str]:
     """Rows with figures that are not quoted, in tables where others are."""
     tables = re.findall(r"(?:^\|.*\n?)+", page, re.MULTILINE)
-    is_quoted = re.compile("|".join(_pattern(text).pattern for text in quoted))
+    is_quoted = _any_of(quoted)
     touched = [table.splitlines() for table in tables if is_quoted.search(table)]
     return [row for rows in touched for row in rows[2:] if re.search(r"\d", is_quoted.sub("", row))]
+
+
+def _without_source(page: str, quoted: Quoted) -> Iterator[str]:
+    """The beginnings of blocks with figures that look measured, and of which nothing says where they are from."""
+    page = _any_of(quoted).sub("...", page)
+    page = NO_PROSE.sub(lambda found: found[0] if DATED.search(found[0]) else "", page)
+    page = re.sub(r"^(#+ .*)$", r"\n\1\n", page, flags=re.MULTILINE)
+    level, above = 0, ""
+    for block in re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )", page):
+        is_table = block.lstrip().startswith("|")
+        with_mark = f"{above} {block}" if is_table or above.strip() == GIVEN else block
+        if heading := re.match(r"\s*(#+) ", block):
+            if GIVEN in with_mark or len(heading[1]) <= level:
+                level = len(heading[1]) if GIVEN in with_mark else 0
+        elif (figure := _measured(block, is_table)) and not (level or GIVEN in with_mark or DATED.search(with_mark)):
+            yield f"{' '.join(block.split())[:60]} ({figure})"
+        above = block
+
+
+def _measured(block: str, is_table: bool) -> str:
+    """The first figure that looks measured: with a unit, or in a table whose head has one."""
+    head, _, rows = block.strip().partition("\n")
+    found = MEASURED.search(rows if is_table else block)
+    if found is None and is_table and re.search(rf"(?<![\w-])(?:{UNIT}|px\b)", head):
+        found = re.search(r"\d+", rows)
+    return " ".join(found[0].split()) if found else ""
 
 
 def read_results(folder: Path) -> Results:

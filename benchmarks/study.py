@@ -113,10 +113,10 @@ def known_errors(jaws: Path, work: Path, count: int) -> list[dict[str, Any]]:
                 "true_mean_abs_um": case.truth.mean_abs_um,
                 "rms_um": row["rms_um"],
                 "true_rms_um": case.truth.rms_um,
-                "amplitudes": prepared.told[scan.key]["deformation"]["amplitudes"],
+                "amplitudes": prepared.records[scan.key]["deformation"]["amplitudes"],
                 "true_amplitudes": case.truth.amplitudes,
                 "remainder_um": row["remainder_um"],
-                "spans_off_um": spans_off_um(specimen, scan.scan, prepared.told[scan.key]["spans"]),
+                "spans_off_um": spans_off_um(specimen, scan.scan, prepared.records[scan.key]["spans"]),
                 **({} if case.dent is None else dent_found(specimen, common.places, found.place_um, case.dent)),
             }
         )
@@ -184,7 +184,7 @@ def at_one_end(work: Path, count: int) -> list[dict[str, Any]]:
             rng = np.random.default_rng(1)
             storage.write_mesh(file, Mesh(moved, mesh.faces).transformed(random_motion(rng)))
             scan = ScanFile(scanner="s", specimen=stem, scan=mode, path=file)
-            told = measure_file(scan, aligned, StudyOptions(align="area")).told
+            told = measure_file(scan, aligned, StudyOptions(align="area")).record
             far = next(each for each in told["shifts"] if each["label"] == specimen.piece_name(last))
             there = specimen.places.points[specimen.piece == last]
             clamp = rigid_between(nearest, bent(nearest, specimen.curve, mode, um)).inverse()
@@ -352,7 +352,7 @@ def beside_cloudcompare(work: Path) -> list[dict[str, Any]]:
     rows = []
     for scan in chosen:
         specimen = specimen_of(out, scan.specimen)
-        pose = Rigid3.from_matrix(np.array(prepared.told[scan.key]["reference_from_scan"]))
+        pose = Rigid3.from_matrix(np.array(prepared.records[scan.key]["reference_from_scan"]))
         mesh = storage.read_mesh(scan.path).transformed(pose @ specimen.occlusal_from_file)
         points, _ = mesh.sample(20_000, np.random.default_rng(0))
         closest = SignedDistance(specimen.mesh).closest_points(points)

@@ -1,4 +1,4 @@
-"""Sections of the pages of results on qualities, what scans expect, damaged input, killed runs and large meshes."""
+"""Sections of the pages of results on qualities, what scans expect, damaged input, killed runs, tests, large meshes."""
 
 from __future__ import annotations
 
@@ -160,6 +160,30 @@ def kill(result: Result) -> str:
 
 def _wrong(result: Result, verb: str) -> int:
     return sum(run["verb"] == verb for run in result["wrong"])
+
+
+def mutation(result: Result) -> str:
+    """Single changes of the code, by room."""
+    counts = ("tried", "caught", "elsewhere")
+    rooms: Mapping[str, Result] = result["rooms"]
+    rows = [(name, *(room[each] for each in counts), ", ".join(_survivors(room))) for name, room in rooms.items()]
+    rows.append(("all", *(sum(room[each] for room in rooms.values()) for each in counts), ""))
+    return "\n".join(
+        [
+            "Places drawn by a seed are changed one at a time: a comparison, an operator, a sign, a number by a tenth "
+            "(a whole one by 1). Caught are those with which a test fails that `make test` runs: one of the same room "
+            "or, where none does, one of another room that imports the module. Changes that make no difference, as was "
+            "found by reading, do not count (`benchmarks/mutation_equivalent.toml`). `python benchmarks/mutation.py`.",
+            "",
+            markdown_table(("room", "changes", "caught", "in other rooms", "not caught"), rows),
+        ]
+    )
+
+
+def _survivors(room: Result) -> list[str]:
+    """Where they are."""
+    missed = [row for row in room["mutants"] if row["caught_by"] is None and row["equivalent"] is None]
+    return [f"`{row['mutant'].split(': ')[0].split('/')[-1]}:{row['line']}`" for row in missed]
 
 
 def large(result: Result) -> str:

@@ -17,7 +17,7 @@ from cuspid.runtime.memory import keep_freed
 
 
 @contextmanager
-def _ended_by_interrupts() -> Iterator[None]:
+def _exit_on_interrupt() -> Iterator[None]:
     """Ctrl-C ends the program in the block, unless whoever began it wants interrupts passed over."""
     interrupt = signal.getsignal(signal.SIGINT)
     if interrupt is signal.default_int_handler:
@@ -33,7 +33,7 @@ def main() -> None:
         os.environ.setdefault(each, "1")
     keep_freed()
     if threading.current_thread() is threading.main_thread():
-        with _ended_by_interrupts():
+        with _exit_on_interrupt():
             from cuspid import cli
 
             cli.load(sys.argv[1:])

@@ -49,6 +49,7 @@ def test_crowns_of_a_phantom_are_found_by_shape(arch: Arch):
     assert overlap(phantom(arch).mesh, estimate(arch), true_crowns(phantom(arch))) > 0.9
 
 
+@pytest.mark.long
 def test_crowns_without_gum_are_crowns():
     crowns = true_crowns(phantom("upper"))
     alone = phantom("upper").mesh.submesh(crowns)
@@ -64,12 +65,14 @@ def test_a_part_of_a_jaw_is_enough():
         assert overlap(mesh.submesh(part), crowns_by_shape(mesh.submesh(part)), crowns[part]) > 0.9
 
 
+@pytest.mark.long
 def test_a_mirrored_jaw_has_the_mirrored_crowns():
     mesh = phantom().mesh
     mirrored = Mesh(mesh.vertices * [-1.0, 1, 1], mesh.faces[:, ::-1])
     assert overlap(mesh, crowns_by_shape(mirrored), estimate()) > 0.95
 
 
+@pytest.mark.long
 def test_a_finer_mesh_has_the_same_crowns():
     mesh = phantom().mesh
     finer = Mesh(*map(np.asarray, trimesh.remesh.subdivide(mesh.vertices, mesh.faces)))

@@ -141,6 +141,7 @@ def test_the_known_mean_comes_back(population: Population, model: ShapeModel) ->
         assert np.percentile(distance, 95) < 50
 
 
+@pytest.mark.long
 def test_the_mean_does_not_depend_on_the_first_sample(model: ShapeModel, other_model: ShapeModel) -> None:
     assert len(model.mean.mesh.vertices) != len(other_model.mean.mesh.vertices)
     for label, point in model.mean.landmarks.items():

@@ -56,7 +56,7 @@ def test_each_numbering_is_told_from_where_the_teeth_stand(name: str, arch: Arch
     along: Numbering = "along-arch" if universal and arch == "lower" else "auto"
     found = number_teeth("jaw.ply", labels, truth.mesh, arch=arch, numbering=along)
     assert np.mean(found.labels != truth.face_labels) < (0.006 if name == "Palmer" else 1e-9)
-    assert found.notes == () if universal and arch == "upper" else "overrules" in found.notes[0]
+    assert found.notes == () if universal and arch == "upper" else "overrides" in found.notes[0]
 
 
 def test_labels_along_a_small_arch_are_not_taken_for_those_of_the_other_jaw() -> None:

@@ -152,6 +152,7 @@ def test_an_unusual_jaw_is_closed_and_each_tooth_one_patch(unusual: Jaw) -> None
     assert len(np.unique(patch)) == 1 + len(unusual.teeth)
 
 
+@pytest.mark.long
 def test_the_landmarks_of_an_unusual_jaw_lie_on_its_surface(unusual: Jaw) -> None:
     assert set(unusual.landmarks) == set(labels_of(unusual.teeth))
     away = unusual.mesh.closest(np.array([landmark.position for landmark in unusual.landmarks.values()]))[0]

@@ -86,8 +86,8 @@ def test_a_coloured_file_has_landmarks(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "missing", "said"),
     [
-        ("scan", (), r"colours tell 14 teeth, but not whether they are lower or upper ones; give --arch$"),
-        ("lower", (45, 44), r"colours tell 12 teeth, but these are not one row without a gap"),
+        ("scan", (), r"colours separate 14 teeth, but do not show whether they are lower or upper; give --arch$"),
+        ("lower", (45, 44), r"colours separate 12 teeth, but these are not one row without a gap"),
         ("lower", range(30, 50), r"its colours are not those of gum and teeth, one each; give a landmark file"),
     ],
 )

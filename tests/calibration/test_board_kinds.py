@@ -14,7 +14,7 @@ from boards import SIZE, options, photograph, pose_before, scene, undistorted
 from cuspid import storage
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.calibrate import CalibrationOptions, _calibrate_once, calibrate_rig
-from cuspid.calibration.circle_centres import centre_shifts, measured_share
+from cuspid.calibration.circle_centres import centre_shifts, measure_circle_share
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
@@ -233,7 +233,7 @@ def test_circles_of_another_size_are_told(tmp_path: Path, board: Board) -> None:
     for k, (tilt, roll) in enumerate([(0, 10), (35, 20), (-35, 90)]):
         image = photograph(board, camera, pose_before(board, 18.0, tilt, roll_deg=roll), 3, seed=k)
         storage.write_image(tmp_path / "images" / "cam" / f"{k}.png", np.repeat(image[..., None], 3, axis=2))
-        assert measured_share(image, board) == pytest.approx(board.circle_share, rel=0.04)
+        assert measure_circle_share(image, board) == pytest.approx(board.circle_share, rel=0.04)
     given = [*options(replace(board, circle_share=0.8)), "--lens", "OPENCV", "--no-photometry"]
     run("calibrate", tmp_path / "images", "--out", tmp_path / "rig", *given)
     told = " ".join(storage.read_json(tmp_path / "rig" / "calibration.json")["notes"])
@@ -282,7 +282,7 @@ def test_files_of_boards_are_read(tmp_path: Path, text: str, board: Board) -> No
         (KALIBR.replace("tagSize: 0.088", "tagSize: 88.0"), r"tagSize is 88.0; it must lie between 1e-06 and 10"),
         (KALIBR.replace("tagCols: 6 ", "tagCols: six "), "tagCols is 'six'; it must be a number"),
         ("target_type: aprilgrid\n", "the field 'tagCols' is missing"),
-        ("columns: 5\nsquares: 3\n", "'squares' is no option of a board"),
+        ("columns: 5\nsquares: 3\n", "'squares' is not an option of a board"),
         ("columns: 5\n", "square_mm is missing"),
         ("columns: 5.5\nsquare_mm: 1\n", "columns is 5.5; it must be a whole number"),
         ("legacy: 1\nsquare_mm: 1\n", "legacy is 1; it must be true or false"),

@@ -27,7 +27,7 @@ from cuspid.calibration.bundle import BoardScene, adjust_board
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig
 from cuspid.calibration.corners import BoardView, find_corners
 from cuspid.calibration.start import board_pose, first_camera, renumber_instant
-from cuspid.calibration.timing import adjust_scene, allow_delays, rolling
+from cuspid.calibration.timing import adjust_scene, allow_delays, allow_rolling
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
 from cuspid.model.camera import Camera
@@ -139,7 +139,7 @@ def test_jacobian_agrees_with_finite_differences(exposure):
     if exposure != "together":
         frame, rng = frame_numbers(truth.rig_from_board), np.random.default_rng(1)
         truth = allow_delays(truth, frame, views)
-        truth = rolling(truth, frame, views) if exposure == "rolling" else truth
+        truth = allow_rolling(truth, frame, views) if exposure == "rolling" else truth
         later = [rng.normal(0, 0.2, count) for count in (3, len(truth.timing.readout), len(views))]
         truth = replace(truth, timing=truth.timing.later(*later))
     even = BoardShape.even(BOARD)

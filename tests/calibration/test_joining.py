@@ -100,7 +100,7 @@ def test_ids_tell_boards_and_may_not_meet() -> None:
     with pytest.raises(InputError, match=r"numbers 1 and 2 both have the id 10 \(0-14 and 10-24\)"):
         BoardSet(boards=(ONE, replace(ONE, first_id=10)))
     BoardSet(boards=(ONE, replace(ONE, dictionary="5X5_1000")))  # of another family
-    with pytest.raises(InputError, match="number 2 is a chessboard, which nothing tells from the others"):
+    with pytest.raises(InputError, match="number 2 is a chessboard, which cannot be distinguished from the others"):
         BoardSet(boards=(ONE, Board(kind="chessboard")))
     with pytest.raises(InputError, match="number 1 has terraces"):
         BoardSet(boards=(replace(ONE, terraces=2), TWO))
@@ -301,5 +301,7 @@ def test_boards_are_said_once_and_drawn_each(tmp_path: Path, capsys: pytest.Capt
     storage.write_image(tmp_path / "images" / "left" / "0.png", np.zeros((32, 32, 3), np.uint8))
     calibrate = ("calibrate", tmp_path / "images", "--out", tmp_path / "rig")
     assert "the files describe 2 boards already" in refused(capsys, *calibrate, "--board", file, "--copies", 2)
-    assert "nothing tells from the others" in refused(capsys, *calibrate, "--kind", "chessboard", "--copies", 2)
+    assert "cannot be distinguished from the others" in refused(
+        capsys, *calibrate, "--kind", "chessboard", "--copies", 2
+    )
     assert "no such file" in refused(capsys, *calibrate, "--board", tmp_path / "none.yaml")

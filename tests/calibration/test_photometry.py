@@ -18,7 +18,7 @@ from cuspid.calibration.patches import clear_places
 from cuspid.calibration.photometry import (
     Photometry,
     PhotometryOptions,
-    _as_told,
+    _keep_unobservable_falloff,
     _numbers,
     calibrate_light,
     look_at_patches,
@@ -225,7 +225,7 @@ def test_a_falloff_that_the_images_do_not_tell_is_neither_stored_nor_stated(sigm
     given = Sensor(falloff=(-0.2, -0.1))
     found = replace(given, gain=1.1, falloff=(0.9, -0.3), covariance=np.diag([1e-4, sigma**2 / 8, sigma**2 / 8, 1e-3]))
     noise = Noise(read_dn2=1.0, per_dn=0.1, noise_sigma_dn=0.1, levels_dn=np.zeros(0), variances_dn2=np.zeros(0))
-    numbers, stored, told = _numbers(found, noise), _as_told(found, given), sigma < 0.1
+    numbers, stored, told = _numbers(found, noise), _keep_unobservable_falloff(found, given), sigma < 0.1
     assert (numbers["corner_loss_pct"] is not None) == told
     assert (numbers["corner_loss_sigma_pct"] is not None) == told
     assert stored.falloff == (found.falloff if told else given.falloff)

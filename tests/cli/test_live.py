@@ -76,7 +76,7 @@ def test_without_frames_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFi
     assert "no such folder" in refused(capsys, "live", tmp_path / "none", "--watch", "--out", out)
     storage.write_handpiece(tmp_path / "capture" / "handpiece.json", scan().handpiece)
     message = refused(capsys, "live", tmp_path / "capture", "--watch", "--end-s", 0.2, "--out", out)
-    assert "no frame has come" in message
+    assert "no usable frame has arrived" in message
     assert not out.exists()
 
 
@@ -116,7 +116,7 @@ def test_what_was_taken_is_reconstructed_whatever_ends_the_scan(
     error = InputError("folder: closed")
     taken = _follow_feed(feed(scan().frames[0], error=error), tmp_path, FIXED, None)
     assert len(taken.frames) == 1
-    assert "note: folder: closed; the scan is ended" in capsys.readouterr().err
+    assert "note: folder: closed; scan ended" in capsys.readouterr().err
     with pytest.raises(InputError, match="closed"):
         _follow_feed(feed(error=error), tmp_path, FIXED, None)
 

@@ -102,6 +102,7 @@ def test_floating_pieces_do_not_move_the_alignment():
     assert 0.9 < found.overlap < 0.995
 
 
+@pytest.mark.long
 def test_two_poses_that_fit_alike_are_told_and_chosen_from_alike():
     box = trimesh.creation.box((10.0, 6.0, 4.0)).subdivide_to_size(0.5)
     mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))

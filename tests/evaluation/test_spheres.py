@@ -96,6 +96,7 @@ def test_it_stands_in_the_occlusal_frame(coarse_arch: Jaw) -> None:
     assert coarse_arch.teeth == tuple(sorted(int(label) for label in coarse_arch.spheres))
 
 
+@pytest.mark.long
 def test_the_twelve_cameras_can_scan_it_like_a_jaw(coarse_arch: Jaw) -> None:
     options = ScanPathOptions(frames=50, min_overlap=0.4, jitter_mm=0.0, jitter_deg=0.0)
     path = plan_scan_path(coarse_arch, twelve_cameras(), options, np.random.default_rng(0))

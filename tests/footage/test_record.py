@@ -29,8 +29,8 @@ from cuspid.calibration.corners import BoardView
 from cuspid.calibration.coverage import SIDES, Coverage, CoverageOptions, focal_px_of, homography_of, tilt_of
 from cuspid.footage import record as recorder
 from cuspid.footage.cameras import ExposureOptions
-from cuspid.footage.devices import FormatOptions, V4L2Camera, cameras_there
-from cuspid.footage.jpeg import whole_jpeg
+from cuspid.footage.devices import FormatOptions, V4L2Camera, find_cameras
+from cuspid.footage.jpeg import complete_jpeg
 from cuspid.footage.played import FilmCamera, RenderedCamera
 from cuspid.footage.record import TABLE, Recording, RecordOptions
 from cuspid.footage.slots import Slots
@@ -159,19 +159,19 @@ def test_a_jpeg_of_a_usb_camera_becomes_a_file_with_the_same_pixels():
     whole = jpeg(view(0.1))
     sent = without_tables(whole)
     assert len(sent) < len(whole) - 300
-    mended = whole_jpeg(sent + bytes(57))
+    mended = complete_jpeg(sent + bytes(57))
     assert mended is not None
     assert mended.count(b"\xff\xc4") >= 1
     np.testing.assert_array_equal(*(cv2.imdecode(np.frombuffer(each, np.uint8), 1) for each in (mended, whole)))
-    assert whole_jpeg(whole) == whole, "one that has tables stays as it is"
+    assert complete_jpeg(whole) == whole, "one that has tables stays as it is"
 
 
 def test_a_jpeg_that_was_cut_off_is_none():
     whole = jpeg(view(0.1))
-    assert whole_jpeg(whole[:-200]) is None
-    assert whole_jpeg(whole[5:]) is None
-    assert whole_jpeg(b"") is None
-    assert whole_jpeg(b"\xff\xd8\xff\xd9") is None
+    assert complete_jpeg(whole[:-200]) is None
+    assert complete_jpeg(whole[5:]) is None
+    assert complete_jpeg(b"") is None
+    assert complete_jpeg(b"\xff\xd8\xff\xd9") is None
 
 
 # --- closed loops ----------------------------------------------------------------------------------------------------
@@ -335,7 +335,7 @@ def test_a_camera_is_held_as_it_says_itself():
     }
     assert [str(each) for each in ready.settings] == [
         "exposure_ms 8 held",
-        "gain 10 refused (it says 4)",
+        "gain 10 refused (it reports 4)",
         "white_balance_k 4600 held",
         "focus not settable",
     ]
@@ -350,7 +350,7 @@ def test_what_the_automatic_chose_is_held():
     assert {each.name: each.told for each in ready.settings if each.is_held} == {
         "exposure_ms": 15.6, "white_balance_k": 4600.0,
     }  # fmt: skip
-    assert str(ready.settings[1]) == "gain 4 (the driver does not let it be set)"
+    assert str(ready.settings[1]) == "gain 4 (the driver does not allow it to be set)"
 
 
 def test_a_camera_whose_automatic_does_not_tell_what_it_chose_is_found_out():
@@ -418,9 +418,9 @@ def test_grey_of_16_bits_keeps_them(tmp_path):
 
 
 def test_cameras_that_are_not_there(tmp_path, capsys):
-    assert cameras_there(tmp_path) == ()
+    assert find_cameras(tmp_path) == ()
     (tmp_path / "video0").write_bytes(b"")
-    assert cameras_there(tmp_path) == (), "a file is no camera"
+    assert find_cameras(tmp_path) == (), "a file is no camera"
 
 
 # --- how it ends -----------------------------------------------------------------------------------------------------
@@ -566,7 +566,7 @@ def test_what_cannot_be_recorded_is_refused(tmp_path, capsys):
 
 
 def test_cameras_are_listed_in_one_line_where_there_are_none(capsys, monkeypatch):
-    monkeypatch.setattr("cuspid.cli.record.cameras_there", lambda: ())
+    monkeypatch.setattr("cuspid.cli.record.find_cameras", lambda: ())
     run("record", "--list")
     assert capsys.readouterr().err.splitlines() == [
         "no camera is plugged in (there is no /dev/video* that delivers images)"

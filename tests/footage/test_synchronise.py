@@ -20,10 +20,10 @@ from cuspid import storage
 from cuspid.footage.quality import Looks, QualityOptions, faults, measure_quality, shrink_to_grey
 from cuspid.footage.synchronise import (
     SyncOptions,
-    by_names,
-    by_starts,
-    by_times,
     flash_starts,
+    match_names,
+    match_starts,
+    match_times,
     motion_starts,
     offset_between,
 )
@@ -230,14 +230,14 @@ def test_lights_that_are_not_told_or_cannot_be_are_said(tmp_path, probe, capsys)
     footage = write_folders(tmp_path / "footage", filmed(dict.fromkeys(STARTS, 0), count=6))
     for more, reason in (
         (("--lightings", "a", "c"), "no lighting pattern named 'c'; it has a, b"),
-        (("--lightings", "a", "b", "--sync", "none"), "--lightings: lights that take turns are shared"),
+        (("--lightings", "a", "b", "--sync", "none"), "--lightings: alternating lights require cameras"),
     ):
         line = refused(capsys, "import", footage, "--handpiece", lit(probe), "--out", tmp_path / "capture", *more)
         assert reason in line
         assert not (tmp_path / "capture").exists()
     capture = storage.read_capture(imported(footage, probe))
     assert {frame.lighting for frame in capture.frames} == {None}
-    assert "if they take turns, give --lightings a b" in " ".join(capsys.readouterr().err.split())
+    assert "if the patterns alternate, give --lightings a b" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_part_of_a_long_film_is_chosen_by_time(tmp_path, probe):
@@ -295,7 +295,7 @@ def test_the_order_of_the_cameras_changes_nothing(order, starts):
     expected = {name: start - first for name, start in zip(names, starts, strict=True)}
     assert motion_starts({name: signals[name] for name in order}, OPTIONS) == expected
     assert flash_starts({name: lit[name] for name in order}, OPTIONS) == expected
-    instants = by_starts(expected, dict.fromkeys(order, 200))
+    instants = match_starts(expected, dict.fromkeys(order, 200))
     assert all(k == int(instant.name) - expected[name] for instant in instants for name, k in instant.numbers.items())
 
 
@@ -305,8 +305,8 @@ def test_a_shift_of_all_times_and_the_order_of_the_cameras_change_nothing(shift,
     rng = np.random.default_rng(seed)
     times = {name: np.arange(30) / 30 + rng.uniform(0, 0.007, 30) for name in ("a", "b", "c")}
     times["b"] = np.delete(times["b"], [4, 5, 20])
-    plain = [dict(each.numbers) for each in by_times(times, OPTIONS)]
-    moved = by_times({name: times[name] + shift for name in order}, OPTIONS)
+    plain = [dict(each.numbers) for each in match_times(times, OPTIONS)]
+    moved = match_times({name: times[name] + shift for name in order}, OPTIONS)
     assert [dict(each.numbers) for each in moved] == plain
     assert len(plain) == 30
     assert sum("b" not in numbers for numbers in plain) == 3
@@ -359,7 +359,7 @@ def test_a_flash_that_contradicts_the_names_is_told(tmp_path, probe, capsys):
 
 
 def test_names_are_in_the_order_of_their_numbers():
-    instants = by_names({"a": ["f2", "f10", "f1"], "b": ["f10", "f3"]})
+    instants = match_names({"a": ["f2", "f10", "f1"], "b": ["f10", "f3"]})
     assert [each.name for each in instants] == ["f1", "f2", "f3", "f10"]
     assert dict(instants[3].numbers) == {"a": 1, "b": 0}
 

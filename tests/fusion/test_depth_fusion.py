@@ -270,7 +270,7 @@ def test_the_foot_of_a_perpendicular_must_lie_on_the_surface() -> None:
     normal = np.array([1.5, 0, 1]) / np.hypot(1.5, 1)
     for right, away in [(r, a) for r in np.linspace(-0.3, 0.6, 60) for a in np.linspace(-0.3, 0.3, 25)]:
         point = np.array([right, 0.0, 4 - 1.5 * right]) - away * normal
-        if observe_foot(*evidence.arrays, nearest, 0.3, *point, out):
+        if observe_foot(evidence, nearest, 0.3, *point, out):
             answers.append(abs(out[0] - away))
     assert len(answers) > 100
     assert max(answers) < 1e-4
@@ -454,7 +454,7 @@ def test_evidence_is_the_distance_to_a_tilted_plane() -> None:
     normal = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
     point = np.array([0.4, 0.3, 5 + 0.12 - 0.06]) + 0.07 * normal
     in_cam = depth_map.cam_from_rig.apply(point)
-    assert observe(*evidence.arrays, *in_cam, seen)
+    assert observe(evidence, *in_cam, seen)
     assert seen[0] == pytest.approx(0.07, abs=1e-4)
     assert np.allclose(seen[2:5], normal, atol=1e-3)
 
@@ -491,6 +491,6 @@ def test_no_vertex_in_view_is_culled() -> None:
     depth_map = depth_maps(HILLS)[0]
     cam_from_world = depth_map.cam_from_rig @ POSES[depth_map.frame]
     in_view = depth_map.camera.contains(depth_map.camera.project(cam_from_world.apply(mesh.vertices)))
-    chosen = np.isin(np.arange(len(mesh.vertices)) // 256, votes._in_view(depth_map.camera, cam_from_world))
+    chosen = np.isin(np.arange(len(mesh.vertices)) // 256, votes._chunks_in_view(depth_map.camera, cam_from_world))
     assert in_view.any()
     assert chosen[in_view].all()

@@ -279,7 +279,9 @@ def test_a_brief_that_no_rig_meets_names_the_condition(section: Section) -> None
     brief = brief_of(surfaces={"buccal": 0.99}, cameras=CamerasBrief(max=4), mouth=MouthBrief(clearance_mm=0.3))
     design = optimise_handpiece(brief, [section], 14.0, QUICK)
     assert len(design.handpiece.rig.names) <= 4
-    with pytest.raises(InputError, match=r"no handpiece with at most 4 cameras .* share of buccal: 0.*wanted >= 0.99"):
+    with pytest.raises(
+        InputError, match=r"no handpiece with at most 4 cameras .* share of buccal: 0.*required >= 0.99"
+    ):
         design.check(brief)
 
 

@@ -15,12 +15,12 @@ from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import essential_four, six_cameras, twelve_cameras
 from cuspid.model.pairing import (
     PairingOptions,
+    angle_weight,
     camera_groups,
     guess_working_distance_mm,
     rank_by_points,
     rank_sources,
     stereo_pairs,
-    worth_of_angle,
 )
 from cuspid.runtime.errors import InputError
 
@@ -66,7 +66,7 @@ def test_the_guess_for_a_design_is_of_the_right_size(handpiece):
     ],
 )
 def test_where_cameras_tell_no_distance_none_is_guessed(rig):
-    with pytest.raises(InputError, match="working distance cannot be told from the cameras"):
+    with pytest.raises(InputError, match="working distance cannot be inferred from the cameras"):
         guess_working_distance_mm(rig)
 
 
@@ -139,7 +139,7 @@ def test_views_share_points_or_are_no_sources():
 
 @given(st.floats(0.0, 180.0))
 def test_no_angle_is_a_wall(angle):
-    at, beside = worth_of_angle(np.array([angle, angle + 0.01]))
+    at, beside = angle_weight(np.array([angle, angle + 0.01]))
     assert 0 <= at <= 1
     assert abs(at - beside) < 0.002
 

@@ -26,7 +26,7 @@ from bundle_scenes import (
 )
 from cuspid.geometry import Rigid3
 from cuspid.geometry.cameras import LENSES, MODELS
-from cuspid.model.reconstruction import Reconstruction, chosen_tracks
+from cuspid.model.reconstruction import Reconstruction, select_tracks
 from cuspid.model.rig import Rig
 from cuspid.model.shutter import Shutter
 from cuspid.motion.bundle import adjustment, gauge, normal_equations
@@ -171,7 +171,7 @@ def disturbed_state(seed: int, rig: Rig) -> tuple[normal_equations.State, normal
     rng, prior = np.random.default_rng(seed), adjustment._Prior.of(rig)
     scene = disturbed(make_scene(frames=3, points=40), rng, rig=rig)
     every = np.ones(len(scene.tracks.point_index), dtype=bool)
-    observations, points = adjustment._sorted_by_point(scene.tracks, every)
+    observations, points = adjustment._sort_by_point(scene.tracks, every)
     start = adjustment._initial_state(poses_of(scene), scene.tracks.points[points], prior)
     whitened = rng.normal(size=start.whitened.shape)
     return adjustment._with_calibration(start, prior, whitened), observations, prior
@@ -187,8 +187,8 @@ def test_no_image_sees_a_gauge(seed: int, step: list[float]) -> None:
     state, observations, prior = disturbed_state(seed, with_priors(make_rig()))
     change = gauge.Gauge.of(np.array(step))
     whitened = state.whitened.copy()
-    whitened[:, : gauge.PLACE] = prior.whitened_places(*gauge.moved_places(state, change))
-    moved = adjustment._with_calibration(gauge.moved_world(state, change), prior, whitened)
+    whitened[:, : gauge.PLACE] = prior.whitened_places(*gauge.transform_mounts(state, change))
+    moved = adjustment._with_calibration(gauge.transform_world(state, change), prior, whitened)
     residuals = normal_equations.residual_vectors(state, observations)
     np.testing.assert_allclose(normal_equations.residual_vectors(moved, observations), residuals, atol=1e-7)
     np.testing.assert_allclose(moved.frame_translation[0], state.frame_translation[0], atol=1e-10)
@@ -202,7 +202,7 @@ def test_many_gauges_leave_the_poses_rotations() -> None:
     for _ in range(20):
         for sign in (1, -1):
             change = gauge.Gauge.of(sign * np.array([0.1, 0.2, -0.1, 0.0, 0.0, 0.0, 0.0]))
-            world = gauge.moved_world(world, change)
+            world = gauge.transform_world(world, change)
     squares = world.frame_rotation @ np.swapaxes(world.frame_rotation, 1, 2)
     np.testing.assert_allclose(squares, np.broadcast_to(np.eye(3), squares.shape), atol=1e-12)
     np.testing.assert_allclose(normal_equations.residual_vectors(world, observations), residuals, atol=1e-7)
@@ -213,10 +213,10 @@ def test_many_gauges_leave_the_poses_rotations() -> None:
 def test_no_small_gauge_lessens_the_cost_of_the_best(seed: int) -> None:
     """Stationary in all seven directions, and no worse than where it began."""
     state, _, prior = disturbed_state(seed, with_priors(make_rig()))
-    best = adjustment._at_best_gauge(state, prior)
+    best = adjustment._apply_best_gauge(state, prior)
 
     def cost(step: np.ndarray) -> float:
-        places = prior.whitened_places(*gauge.moved_places(best, gauge.Gauge.of(step)))
+        places = prior.whitened_places(*gauge.transform_mounts(best, gauge.Gauge.of(step)))
         return float(np.sum(places**2))
 
     here = cost(np.zeros(7))
@@ -233,7 +233,7 @@ def test_a_gauge_moves_nothing_that_is_held() -> None:
     change = gauge.best_gauge(state)
     np.testing.assert_allclose(change.turn, np.eye(3), atol=1e-9)
     assert abs(change.scale - 1) > 1e-4
-    rotation, translation = gauge.moved_places(state, change)
+    rotation, translation = gauge.transform_mounts(state, change)
     np.testing.assert_allclose(rotation[0], state.camera_rotation[0], atol=1e-9)
     np.testing.assert_allclose(translation[0], state.camera_translation[0], atol=1e-4)
     fixed = Rig({name: replace(mounted, covariance=None) for name, mounted in rig.cameras.items()})
@@ -265,7 +265,7 @@ def seen_change(state, observations, prior, step: np.ndarray) -> float:
     weighting, change = normal_equations.Weighting(1.0, np.inf, True), []
     poses = 6 * (len(state.frame_rotation) - 1)
     for sign in (1, -1):
-        moved = normal_equations.with_poses_moved(state, sign * 1e-5 * step[:poses])
+        moved = normal_equations.move_poses(state, sign * 1e-5 * step[:poses])
         whitened = state.whitened + sign * 1e-5 * step[poses:].reshape(state.whitened.shape)
         moved = adjustment._with_calibration(moved, prior, whitened)
         settled = normal_equations.refine_points(moved, observations, weighting)
@@ -295,7 +295,7 @@ def test_sharp_images_do_not_drown_what_the_prior_alone_knows(sigma_px: float) -
     """Of the scale; rounding in what the images tell made it some ten times as uncertain for an arch."""
     rig = with_priors(make_rig())
     scene = make_scene(rig=rig, points=120)
-    observations, points = adjustment._sorted_by_point(scene.tracks, np.ones(len(scene.tracks.pixels), dtype=bool))
+    observations, points = adjustment._sort_by_point(scene.tracks, np.ones(len(scene.tracks.pixels), dtype=bool))
     state = adjustment._initial_state(poses_of(scene), scene.tracks.points[points], adjustment._Prior.of(rig))
     expected = [
         adjustment._posterior(state, observations, normal_equations.Weighting(sigma, np.inf, True)).expectation
@@ -364,7 +364,7 @@ def test_errors_that_hang_together_within_a_track_are_accounted_for() -> None:
 def independent(found: Reconstruction) -> np.ndarray:
     """Covariance of the poses if every keypoint had an error of its own."""
     prior = adjustment._Prior.of(found.rig)
-    observations, points = adjustment._sorted_by_point(found.tracks, np.ones(len(found.tracks.pixels), dtype=bool))
+    observations, points = adjustment._sort_by_point(found.tracks, np.ones(len(found.tracks.pixels), dtype=bool))
     state = adjustment._initial_state(poses_of(found), found.tracks.points[points], prior)
     weighting = normal_equations.Weighting(found.log["observation_sigma_px"], np.inf, False)
     inverse = np.linalg.inv(lower_to_full(normal_equations.normal_equations(state, observations, weighting).matrix))
@@ -383,7 +383,7 @@ def size_of(points: np.ndarray) -> float:
 
 def as_the_motion_has_it(found: Reconstruction, scene: Scene) -> np.ndarray:
     """Where the true points come to lie when they are seen without error from the poses and cameras that were found."""
-    observations, points = adjustment._sorted_by_point(scene.tracks, np.ones(len(scene.tracks.pixels), dtype=bool))
+    observations, points = adjustment._sort_by_point(scene.tracks, np.ones(len(scene.tracks.pixels), dtype=bool))
     state = adjustment._initial_state(poses_of(found), scene.tracks.points[points], adjustment._Prior.of(found.rig))
     return normal_equations.refine_points(state, observations, normal_equations.Weighting(1.0, np.inf, False)).points
 
@@ -613,7 +613,7 @@ def test_the_minimum_is_that_of_a_general_solver(knee: float, points_mm: float) 
     cameras = make_rig().cameras
     scene = make_scene(rig=Rig({name: cameras[name] for name in ("c0", "c4")}), frames=3, points=24)
     well_seen = np.bincount(scene.tracks.point_index, minlength=24) >= 4
-    scene = replace(scene, tracks=chosen_tracks(scene.tracks, well_seen[scene.tracks.point_index]))
+    scene = replace(scene, tracks=select_tracks(scene.tracks, well_seen[scene.tracks.point_index]))
     given = disturbed(scene, np.random.default_rng(3), rig=with_priors(scene.rig))
     exactly = AdjustmentOptions(
         sigma_px=SIGMA_PX, huber_sigmas=knee, rounds=1, iterations=500, tolerance=1e-12, start_px=1e9

@@ -21,8 +21,8 @@ from cuspid.motion.frontend.features import (
     FeatureOptions,
     detect,
     detect_all,
+    drop_duplicates,
     select_evenly,
-    without_doubles,
 )
 from cuspid.motion.frontend.pairs import match_unguided
 from cuspid.motion.frontend.pictures import Pictures
@@ -126,8 +126,8 @@ def test_a_place_with_several_orientations_is_one_keypoint() -> None:
     for keypoint in keypoints:
         expected.setdefault((*np.round(keypoint.pt, 2).tolist(), round(keypoint.size, 2)), keypoint)
     assert 100 < len(expected) < 0.95 * len(keypoints)
-    assert without_doubles(keypoints) == list(expected.values())
-    assert without_doubles([]) == []
+    assert drop_duplicates(keypoints) == list(expected.values())
+    assert drop_duplicates([]) == []
 
 
 @pytest.mark.parametrize("gray", [0, 128, 255])

@@ -14,16 +14,16 @@ from scipy.spatial.transform import Rotation
 from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
 from cuspid.model.mesh import Mesh
-from cuspid.model.reconstruction import Reconstruction, Tracks, chosen_tracks, joined_tracks
+from cuspid.model.reconstruction import Reconstruction, Tracks, concatenate_tracks, select_tracks
 from cuspid.model.rig import MountedCamera, Rig
 from cuspid.model.sparse_model import SparseModel
 from cuspid.motion.frontend.patches import (
     PatchOptions,
     align_patches,
+    are_connected,
     cut_patches,
     follow_points,
     follow_rig_points,
-    hold_together,
     lengthen,
 )
 from cuspid.motion.frontend.tracks import points_across
@@ -138,7 +138,7 @@ def test_points_are_followed_into_every_frame_that_sees_them() -> None:
     second = longer.point_index >= len(given_tracks.points)
     assert len(longer.points) - len(given_tracks.points) >= 50
     assert np.array_equal(longer.pixels[~second], given_tracks.pixels)
-    errors = errors_px(model, chosen_tracks(longer, second))
+    errors = errors_px(model, select_tracks(longer, second))
     assert 0 < np.median(errors) < 0.1
     assert np.quantile(errors, 0.95) < 0.3
     assert second.sum() / 60 > 5
@@ -245,8 +245,9 @@ def test_points_are_followed_into_all_cameras_of_a_handpiece_in_whatever_order()
 
 def test_a_handpiece_of_one_camera_is_that_camera() -> None:
     model, pictures = over_a_wall()
-    every = chosen_tracks(
-        joined_tracks(model.tracks, replace(model.tracks, frame_index=np.tile(np.arange(8), 15))), np.ones(240, bool)
+    every = select_tracks(
+        concatenate_tracks(model.tracks, replace(model.tracks, frame_index=np.tile(np.arange(8), 15))),
+        np.ones(240, bool),
     )
     model = replace(model, tracks=every)
     rig = Rig({"camera": MountedCamera(model.camera, Rigid3.identity())})
@@ -271,8 +272,8 @@ def test_frames_hold_together_where_enough_points_are_seen_on_both_sides(lost: t
         camera_index=np.zeros(len(point), np.int64),
         pixels=np.zeros((len(point), 2)),
     )
-    assert hold_together(tracks, 8, 12) is held
-    assert not hold_together(tracks, 8, 13)
+    assert are_connected(tracks, 8, 12) is held
+    assert not are_connected(tracks, 8, 13)
 
 
 def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
@@ -285,7 +286,7 @@ def test_points_seen_in_too_few_frames_stay_as_they_were() -> None:
 def test_tracks_are_taken_apart_and_joined() -> None:
     tracks = over_a_wall()[0].tracks
     early = tracks.frame_index == 3
-    joined = joined_tracks(chosen_tracks(tracks, early), chosen_tracks(tracks, ~early))
+    joined = concatenate_tracks(select_tracks(tracks, early), select_tracks(tracks, ~early))
     assert len(joined.points) == 2 * len(tracks.points)
     assert np.array_equal(joined.pixels, np.concatenate([tracks.pixels[early], tracks.pixels[~early]]))
     place = np.concatenate([tracks.points[tracks.point_index[each]] for each in (early, ~early)])

@@ -67,6 +67,7 @@ def test_poses_and_lens_are_those_of_the_camera(model):
     assert 0.05 < model.reprojection_rms_px < 0.6
 
 
+@pytest.mark.long
 def test_the_board_sets_the_scale(model, photographs):
     scale = photograph_pipeline.find_scale(model, photographs, BOARD_OPTIONS)
     true = scene().poses
@@ -74,7 +75,7 @@ def test_the_board_sets_the_scale(model, photographs):
     assert 0 < abs(scale.mm_per_unit / expected - 1) < 0.001
     assert 0 < scale.sigma_share < 0.001
     assert not scale.notes
-    located = photograph_pipeline.handed_over(model, photographs, scale)
+    located = photograph_pipeline.to_capture(model, photographs, scale)
     assert located.found.has_scale
     depth = np.concatenate([depth[np.isfinite(depth)] for depth in scene().depths.values()])
     near, far = located.capture.handpiece.depth_range_mm
@@ -83,6 +84,7 @@ def test_the_board_sets_the_scale(model, photographs):
     assert np.percentile(depth, 98) < far < 1.5 * depth.max()
 
 
+@pytest.mark.long
 def test_a_bent_board_is_told(model, photographs, monkeypatch):
     flat = type(BOARD).corners.fget
     bent = property(lambda board: flat(board) + [[0, 0, 1.0]] * np.square(flat(board)[:, :1] / 10 - 1))
@@ -136,6 +138,7 @@ def test_a_calibration_is_held(photographs):
     assert 0 < np.linalg.norm(off, axis=1).max() < 0.1
 
 
+@pytest.mark.long
 def test_a_measured_distance_sets_the_scale(model, photographs):
     true = scene().poses
     ends = np.array([[*BOARD_PLACE_MM, 0.0], [-4.0, 2.0, 0.0]])
@@ -153,6 +156,7 @@ def test_a_measured_distance_sets_the_scale(model, photographs):
         photograph_pipeline.find_scale(model, photographs, replace(options, distance=swapped))
 
 
+@pytest.mark.long
 def test_without_a_scale_nothing_is_in_millimetres(model, photographs, tmp_path, monkeypatch):
     monkeypatch.setattr(photograph_pipeline, "locate_photographs", lambda *_, **__: model)
     located = photograph_pipeline.locate(photographs, tmp_path)
@@ -190,8 +194,9 @@ def test_twice_the_size_has_twice_the_focal_length(model, tmp_path):
     assert 0 < abs(larger.focal_px[0] / (2 * model.cameras["camera"].focal_px[0]) - 1) < 0.01
 
 
+@pytest.mark.long
 def test_given_poses_are_taken(model, photographs, tmp_path):
-    located = photograph_pipeline.handed_over(model, photographs, None)
+    located = photograph_pipeline.to_capture(model, photographs, None)
     files = {name: f"{name}.JPG" for name in model.frames}
     write_model(tmp_path / "sparse", located.found, located.capture, files)
     half = tmp_path / "half"
@@ -211,8 +216,9 @@ def test_given_poses_are_taken(model, photographs, tmp_path):
     assert 0.05 < posed.reprojection_rms_px < 1.0
 
 
+@pytest.mark.long
 def test_poses_of_other_photographs_are_refused(model, photographs, tmp_path):
-    located = photograph_pipeline.handed_over(model, photographs, None)
+    located = photograph_pipeline.to_capture(model, photographs, None)
     write_model(tmp_path, located.found, located.capture, {name: f"other-{name}.png" for name in model.frames})
     with pytest.raises(InputError, match=r"named like other-IMG_00\.png"):
         take_photograph_poses(photographs, tmp_path)
@@ -380,6 +386,7 @@ def test_masks_that_do_not_fit_are_refused(tmp_path, capsys, shape, value, said)
     assert "masks/1.png" in line
 
 
+@pytest.mark.long
 def test_a_board_that_no_photograph_shows_is_told(model, photographs):
     absent = replace(BOARD_OPTIONS, dictionary="7X7_50")
     with pytest.raises(ReconstructionError, match="is seen in none of 8 photographs"):

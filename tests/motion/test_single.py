@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid.model.panorama import FrameUse
-from cuspid.motion.monocular.single import loose_notes, loosely_held
+from cuspid.motion.monocular.single import weak_stretch_notes, weak_stretches
 
 USUAL = 400
 
@@ -30,7 +30,7 @@ def weak(*stretches: tuple[int, int, int], count: int = 60) -> list[int]:
 
 
 def names(counts: Sequence[int | None]) -> list[tuple[str, str]]:
-    return [(stretch[0].name, stretch[-1].name) for stretch in loosely_held(frames(counts))]
+    return [(stretch[0].name, stretch[-1].name) for stretch in weak_stretches(frames(counts))]
 
 
 @given(st.integers(4, 50), st.integers(0, 5), st.integers(1, 190))
@@ -41,7 +41,7 @@ def test_a_weak_stretch_is_told_and_no_other(first: int, more: int, fewer: int) 
 
 @given(st.lists(st.integers(200, 399), min_size=10, max_size=60), st.integers(1, 50))
 def test_what_varies_less_than_twofold_is_held_well_whatever_the_number(counts: list[int], factor: int) -> None:
-    assert loosely_held(frames([factor * count for count in counts])) == ()
+    assert weak_stretches(frames([factor * count for count in counts])) == ()
 
 
 @given(st.integers(0, 59), st.integers(2, 1000))
@@ -63,13 +63,13 @@ def test_ends_and_frames_without_a_place_do_not_count() -> None:
 
 
 def test_nothing_is_told_where_observations_are_not_known() -> None:
-    assert loosely_held(()) == ()
-    assert loosely_held(tuple(FrameUse(name=f"{k}", used=True) for k in range(20))) == ()
+    assert weak_stretches(()) == ()
+    assert weak_stretches(tuple(FrameUse(name=f"{k}", used=True) for k in range(20))) == ()
 
 
 def test_the_note_names_the_frames_and_what_is_usual() -> None:
-    (note,) = loose_notes(frames(weak((10, 12, 150), (30, 30, 50))))
+    (note,) = weak_stretch_notes(frames(weak((10, 12, 150), (30, 30, 50))))
     assert "frame 030 (50 points), frames 010 to 012 (150 points), where 400 are usual" in note
-    assert loose_notes(frames(weak())) == ()
-    (many,) = loose_notes(frames(weak(*((first, first, 9) for first in range(8, 56, 8)))))
+    assert weak_stretch_notes(frames(weak())) == ()
+    (many,) = weak_stretch_notes(frames(weak(*((first, first, 9) for first in range(8, 56, 8)))))
     assert "and at 3 other places" in many

@@ -292,8 +292,8 @@ def test_what_looks_like_a_place_is_not_taken_for_it() -> None:
     way = {f"{k:05d}": Rigid3(np.eye(3), np.array([-x, 0, 0])) for k, x in enumerate([*left, *right])}
     maps, names = depth_maps(way, height_field(twins, half_width_mm=19.0)), list(way)
     lying = _register_icp(surface(maps, names[4]), surface(maps, names[14]), Rigid3.identity(), 5.0)
-    assert lying.laid is not None
-    assert lying.laid.share > 0.5
+    assert lying.match is not None
+    assert lying.match.share > 0.5
     found = tracked(maps)
     assert found.frames == tuple(names[: len(left)])
     assert errors_um(found, way).max() < 25

@@ -10,7 +10,7 @@ import pytest
 from cuspid.geometry import Rigid3
 from cuspid.model.pairing import PairingOptions
 from cuspid.model.rig import Handpiece, Rig, Sensor
-from cuspid.mvs.across import AcrossOptions, measure_moving_cameras, moving_pair
+from cuspid.mvs.across import AcrossOptions, consecutive_pair, measure_moving_cameras
 from cuspid.mvs.matching import StereoOptions
 from synthetic_scene import cast_depth, diamond, height_field, render
 
@@ -47,8 +47,8 @@ def test_one_moving_camera_measures_depth(sensors: dict[str, Sensor]) -> None:
 
 def test_a_camera_that_hardly_moved_is_left_out() -> None:
     still = Rigid3(np.eye(3), np.array([-0.1, 0, 0]))
-    assert moving_pair(lone_camera(), "west", still, PairingOptions()) is None
-    assert moving_pair(lone_camera(), "west", STEP, PairingOptions()) is not None
+    assert consecutive_pair(lone_camera(), "west", still, PairingOptions()) is None
+    assert consecutive_pair(lone_camera(), "west", STEP, PairingOptions()) is not None
 
 
 def test_a_camera_that_moved_along_its_axis_or_turned_away_is_left_out() -> None:
@@ -56,4 +56,4 @@ def test_a_camera_that_moved_along_its_axis_or_turned_away_is_left_out() -> None
     turned = Rigid3.from_rotation_vector(np.array([0, 0.6, 0]), np.array([-1.1, 0, 0]))
     away = Rigid3(np.eye(3), np.array([-5.0, 0, 0]))
     for motion in (closer, turned, away):
-        assert moving_pair(lone_camera(), "west", motion, PairingOptions()) is None
+        assert consecutive_pair(lone_camera(), "west", motion, PairingOptions()) is None

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cuspid.geometry import Rigid3, unit
-from cuspid.geometry.gloss import leaving
+from cuspid.geometry.gloss import transmittance
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Handpiece, Light
 from cuspid.mvs.glare import estimate_glare, mirror_reflections
@@ -74,10 +74,10 @@ def test_reflections_go_with_the_share_that_passes_and_not_with_power_or_scale()
 
 def test_less_light_leaves_at_grazing_angles() -> None:
     angles = np.deg2rad([0, 30, 60, 80, 90])
-    shares = np.array([leaving(np.cos(angle), 1.4) for angle in angles])
+    shares = np.array([transmittance(np.cos(angle), 1.4) for angle in angles])
     # Fresnel's equations: 6.7 % of the light is reflected at 60 degrees, 2.8 % at 0, 38.8 % at 80, all at 90.
     assert shares == pytest.approx([1, 0.9990, 0.955, 0.651, 0], abs=0.004)
-    assert leaving(0.3, 1.0) == pytest.approx(1)
+    assert transmittance(0.3, 1.0) == pytest.approx(1)
 
 
 def test_a_pit_that_a_reflection_made_is_looked_past() -> None:
@@ -127,6 +127,7 @@ def test_polarisers_that_leak_do_little_harm(leak: float, most: float) -> None:
     assert known < 0.95 * unknown
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coloured", [False, True])
 def test_light_that_is_lost_matters_where_the_lights_have_one_colour(coloured: bool) -> None:
     handpiece = lit() if coloured else white(lit())

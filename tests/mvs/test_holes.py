@@ -19,7 +19,7 @@ from cuspid.model.capture import Frame
 from cuspid.model.reconstruction import DepthMap, Reconstruction, SurfacePoints, Tracks
 from cuspid.mvs import stage
 from cuspid.mvs.across import AcrossOptions
-from cuspid.mvs.holes import Sightings, Views, covering
+from cuspid.mvs.holes import Sightings, Views, greedy_cover
 from cuspid.mvs.matching import StereoOptions
 from synthetic_scene import diamond
 
@@ -28,7 +28,7 @@ SETS = st.lists(st.sets(st.integers(0, 39), max_size=15), max_size=12)
 
 @given(sets=SETS, left=st.integers(0, 12))
 def test_the_sets_that_are_taken_cover_all_but_what_may_be_left(sets: list[set[int]], left: int) -> None:
-    taken = covering([np.array(sorted(each), dtype=np.int64) for each in sets], 40, float(left))
+    taken = greedy_cover([np.array(sorted(each), dtype=np.int64) for each in sets], 40, float(left))
     every, covered = set().union(*sets), set().union(*(sets[k] for k in taken))
     assert len(every - covered) <= left
     assert taken == sorted(set(taken))
@@ -37,7 +37,7 @@ def test_the_sets_that_are_taken_cover_all_but_what_may_be_left(sets: list[set[i
 
 @given(sets=SETS, least=st.integers(1, 6))
 def test_no_set_is_taken_that_adds_too_little(sets: list[set[int]], least: int) -> None:
-    taken = covering([np.array(sorted(each), dtype=np.int64) for each in sets], 40, least=least)
+    taken = greedy_cover([np.array(sorted(each), dtype=np.int64) for each in sets], 40, least=least)
     covered = set().union(*(sets[k] for k in taken))
     assert all(len(each - covered) < least for each in sets)
     assert len(taken) * least <= len(covered)
@@ -259,4 +259,4 @@ def test_a_frame_between_is_measured_by_the_cameras_that_show_what_is_missing(
 
 def test_every_second_frame_of_each_light_comes_first() -> None:
     frames = [Frame(name=f"{k}", cameras=("a",), lighting=lit) for k, lit in enumerate("xyxyyxx")]
-    assert [frame.name for frame in stage._every_second(frames)] == ["0", "1", "4", "5"]
+    assert [frame.name for frame in stage._select_every_second(frames)] == ["0", "1", "4", "5"]

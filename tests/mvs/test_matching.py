@@ -22,9 +22,9 @@ from cuspid.mvs.confidence import (
     Measured,
     Resolution,
     agreement,
-    at_near_borders,
     confidence,
-    without_speckle,
+    occlusion_borders,
+    reject_speckle,
 )
 from cuspid.mvs.initial_depth import initial_pairs, semi_global
 from cuspid.mvs.matching import DepthEstimator, StereoOptions, ViewSet, coarser, group_geometry
@@ -372,7 +372,7 @@ def test_the_near_side_of_a_border_is_found() -> None:
     depth = np.full((20, 20), 5.0)
     depth[:, :10], depth[:3] = 4.0, np.nan
     pair = [replace(flat((0, 0), 5.0), depth_mm=depth), flat((2.5, 0), 5.0)]
-    borders = at_near_borders(*pair, 2, RESOLUTION, ConfidenceOptions())
+    borders = occlusion_borders(*pair, 2, RESOLUTION, ConfidenceOptions())
     assert borders[3:, 8:10].all()
     assert not borders[:, :8].any()
     assert not borders[:, 10:].any()
@@ -389,7 +389,7 @@ def sloping(slant_deg: float, towards_deg: float) -> np.ndarray:
 @given(slant_deg=st.floats(0, 55), towards_deg=st.floats(0, 360), baseline_mm=st.floats(0.3, 5))
 def test_a_steep_surface_has_no_borders_within(slant_deg: float, towards_deg: float, baseline_mm: float) -> None:
     pair = [replace(flat((0, 0), 5.0), depth_mm=sloping(slant_deg, towards_deg)), flat((baseline_mm, 0), 5.0)]
-    borders = at_near_borders(*pair, 2, RESOLUTION, ConfidenceOptions())
+    borders = occlusion_borders(*pair, 2, RESOLUTION, ConfidenceOptions())
     assert not borders[2:-2, 2:-2].any()
 
 
@@ -466,7 +466,7 @@ def test_speckle_goes_and_surface_stays() -> None:
     depth[:, :20] = 5.0
     depth[5:8, 30:33] = 5.0
     depth[20:23, 5:8] = 6.0
-    keep = without_speckle(depth, RESOLUTION, ConfidenceOptions(speckle_px=20))
+    keep = reject_speckle(depth, RESOLUTION, ConfidenceOptions(speckle_px=20))
     assert keep[:, :5].all()
     assert not keep[:, 20:].any()
     assert not keep[20:23, 5:8].any()

@@ -115,7 +115,7 @@ def test_lights_that_are_not_told_are_asked_for(images: dict[str, np.ndarray]) -
     one, *others = lit().lights
     two = replace(lit(), lightings=(Lighting(name="a", lights=(one,)), Lighting(name="b", lights=tuple(others))))
     estimator = DepthEstimator(two, OPTIONS, signal="shading")
-    with pytest.raises(InputError, match=r"frame 7: which lights were on is not told.*\(a, b\)"):
+    with pytest.raises(InputError, match=r"frame 7: which lights were on is unknown.*\(a, b\)"):
         estimator.measure(images, "7")
     assert known_share(estimator.measure(images, "7", "b")) > 0.1
     assert DepthEstimator(two, OPTIONS).measure(images, "7")  # texture does not ask

@@ -28,13 +28,13 @@ from cuspid.model.rig import Handpiece, MountedCamera, Rig
 from cuspid.model.tolerances import NominalOptions
 from cuspid.motion.frontend.features import detect
 from cuspid.mvs import DepthEstimator, StereoOptions
-from cuspid.mvs.confidence import ConfidenceOptions, Resolution, without_speckle
+from cuspid.mvs.confidence import ConfidenceOptions, Resolution, reject_speckle
 from cuspid.mvs.matching import find_weak_texture, group_geometry
 from cuspid.mvs.rectification import IdealView
 from cuspid.mvs.refinement import image_noise
 from cuspid.mvs.regularised import even_out, sweep
 from cuspid.mvs.view_stage import measure_view_depth
-from cuspid.pipeline.scan import ReconstructionOptions, _hold_what_fits
+from cuspid.pipeline.scan import ReconstructionOptions, _hold_consistent_calibration
 from cuspid.runtime.errors import InputError, ReconstructionError
 from hilly_scan import scan
 from synthetic_scene import cast_depth, diamond, height_field, render
@@ -179,12 +179,12 @@ def test_a_surface_is_one_piece_however_steep_and_what_stands_alone_is_none(tilt
     depth[:, :3] = np.nan
     depth[20, 30] += 1.0
     depth[5:8, 5:8] = 3 + 0.1 * np.random.default_rng(seed).random((3, 3))
-    kept = without_speckle(depth, resolution, options)
+    kept = reject_speckle(depth, resolution, options)
     expected = np.isfinite(depth)
     expected[20, 30] = False
     expected[5:8, 5:8] = False
     assert np.array_equal(kept, expected)
-    made_smooth = without_speckle(depth, resolution, options, np.ones(depth.shape, dtype=bool))
+    made_smooth = reject_speckle(depth, resolution, options, np.ones(depth.shape, dtype=bool))
     gentle = np.abs(np.diff(np.log(depth[30]))[3:]).max() < 5 * 0.012 / 5
     assert not (made_smooth & ~expected).any()
     assert np.array_equal(made_smooth, expected) == gentle
@@ -285,7 +285,7 @@ def test_one_instant_refines_only_a_calibration_that_it_contradicts(tmp_path: Pa
     images = {("0", name): render(HILLS, each, Rigid3.identity(), rng) for name, each in built.items()}
     nominal = NominalOptions().for_handpiece(handpiece).fill(handpiece)
     capture = Capture(handpiece=nominal, frames=(Frame(name="0", cameras=nominal.rig.names),), source=InMemory(images))
-    known, notes = _hold_what_fits(capture, True, tmp_path, ReconstructionOptions(), lambda *_: None)
+    known, notes = _hold_consistent_calibration(capture, True, tmp_path, ReconstructionOptions(), lambda *_: None)
     assert (known.handpiece.rig["east"].covariance is None) == held
     assert bool(notes) == held
 

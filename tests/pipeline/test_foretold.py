@@ -39,7 +39,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def test_the_time_is_that_of_the_first_images(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
     timed = 4 * usable_cores()
     with caplog.at_level("INFO", logger="cuspid"):
-        steps = list(stage._foretold(clock.rendered(timed + 9, 1220, 0.5, before=20), ["one", "two"]))
+        steps = list(stage._log_expected_time(clock.rendered(timed + 9, 1220, 0.5, before=20), ["one", "two"]))
     assert steps == [(done, 1220) for done in range(21, timed + 30)]
     left = 1200 - timed
     assert caplog.messages == [
@@ -50,8 +50,8 @@ def test_the_time_is_that_of_the_first_images(clock: Clock, caplog: pytest.LogCa
 def test_short_work_offers_nothing_shorter(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
     images = 40 * usable_cores()
     with caplog.at_level("INFO", logger="cuspid"):
-        list(stage._foretold(clock.rendered(images, images, 0.01), ["one"]))
-        list(stage._foretold(clock.rendered(1, 1, 0.01), ["one"]))
+        list(stage._log_expected_time(clock.rendered(images, images, 0.01), ["one"]))
+        list(stage._log_expected_time(clock.rendered(1, 1, 0.01), ["one"]))
     (told,) = caplog.messages
     assert told.endswith(f"of {images} images are to come, about {0.01 * 36 * usable_cores():.0f} s here")
 
@@ -64,7 +64,7 @@ def test_the_forecast_of_fewer_passes_is_about_right(coarse_phantom: Jaw) -> Non
     )
     kept = len(path.rig_from_world) - path.further_frames
     assert path.further_frames > 0
-    passes, _ = stage._less(path)
+    passes, _ = stage._cheaper_settings(path)
     assert f"about {kept / len(path.rig_from_world):.0%}" in passes
     assert kept == pytest.approx(len(alone.rig_from_world), abs=0.3 * len(alone.rig_from_world))
     assert alone.further_frames == 0

@@ -22,7 +22,7 @@ from cuspid.model.reconstruction import Tracks
 from cuspid.model.sparse_model import SparseModel
 from cuspid.model.trueness import GroundTruth
 from cuspid.motion.monocular.single import SingleOptions, locate_single, mouth_share, normalise_contrast
-from cuspid.pipeline.panorama import StitchOptions, stitch, that_show_something
+from cuspid.pipeline.panorama import StitchOptions, require_content, stitch
 from cuspid.pipeline.scan import RenderOptions, take_images
 from cuspid.runtime.errors import InputError, ReconstructionError
 from cuspid.simulation.path.free import FreePathOptions, plan_free_path
@@ -79,6 +79,7 @@ def test_every_frame_is_placed_and_pixels_show_what_lies_there(
     assert np.percentile(errors, 95) < 1.3
 
 
+@pytest.mark.long
 def test_the_camera_was_where_it_is_found(stitched: Stitched, film: tuple[Capture, GroundTruth]) -> None:
     assert stitched.motion is not None
     from_rig = film[1].handpiece.rig["camera"].cam_from_rig
@@ -89,6 +90,7 @@ def test_the_camera_was_where_it_is_found(stitched: Stitched, film: tuple[Captur
     assert 1e-5 < errors.max() < 0.1
 
 
+@pytest.mark.long
 def test_the_panorama_is_not_mirrored_and_heights_are_those_of_the_jaw(
     stitched: Stitched, film: tuple[Capture, GroundTruth], sequence: ImageSequence
 ) -> None:
@@ -103,6 +105,7 @@ def test_the_panorama_is_not_mirrored_and_heights_are_those_of_the_jaw(
     assert np.corrcoef(heights, true[:, 2])[0, 1] > 0.4
 
 
+@pytest.mark.long
 def test_overlaps_inliers_and_notes_are_told(stitched: Stitched) -> None:
     frames = stitched.panorama.frames
     assert frames[0].overlap is None
@@ -117,13 +120,14 @@ def test_overlaps_inliers_and_notes_are_told(stitched: Stitched) -> None:
 def test_a_path_that_the_surface_does_not_hold_stays_and_a_note_tells(
     sequence: ImageSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cuspid.pipeline.panorama.that_show_something", tuple)  # there is no picture without a surface
+    monkeypatch.setattr("cuspid.pipeline.panorama.require_content", tuple)  # there is no picture without a surface
     options = StitchOptions(plane_sweep=PlaneSweepOptions(agreement=0.99))
     (made,) = stitch(sequence, options)
     assert all(frame.used for frame in made.panorama.frames)
     assert any("found again on the surface" in note for note in made.panorama.notes)
 
 
+@pytest.mark.long
 def test_the_strip_is_as_long_as_the_way_of_the_camera(stitched: Stitched) -> None:
     strip = stitched.strip
     assert strip is not None
@@ -246,19 +250,20 @@ def test_two_films_are_stitched_as_two_parts(sequence: ImageSequence, tmp_path: 
     assert any(frame.reason == "in part 2" for frame in parts[0].panorama.frames)
 
 
+@pytest.mark.long
 def test_an_empty_picture_is_no_panorama(stitched: Stitched) -> None:
     """Of frames that hardly overlap it was one of status 0 without a pixel."""
-    assert that_show_something([stitched]) == (stitched,)
+    assert require_content([stitched]) == (stitched,)
     nothing = np.zeros_like(stitched.panorama.covered)
     empty = replace(stitched, panorama=replace(stitched.panorama, covered=nothing))
-    assert len(that_show_something([empty, stitched])) == 2
+    assert len(require_content([empty, stitched])) == 2
     with pytest.raises(ReconstructionError, match=rf"the {FRAMES} frames that were placed give no picture; take them"):
-        that_show_something([empty])
+        require_content([empty])
     assert stitched.motion is not None
     tracks = stitched.motion.tracks
     few = replace(tracks, **{name: getattr(tracks, name)[:40] for name in OF_OBSERVATIONS})
     with pytest.raises(ReconstructionError, match=r"no picture, as neighbours share only \d+ points; take them"):
-        that_show_something([replace(empty, motion=replace(stitched.motion, tracks=few))])
+        require_content([replace(empty, motion=replace(stitched.motion, tracks=few))])
 
 
 OF_OBSERVATIONS = ("point_index", "frame_index", "camera_index", "pixels")

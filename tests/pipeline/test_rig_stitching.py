@@ -14,7 +14,7 @@ from cuspid import storage
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.handpiece.intra_oral import IntraOralOptions, intra_oral_camera
 from cuspid.model.arch_curve import arch_curve
-from cuspid.model.capture import Capture
+from cuspid.model.capture import Capture, Frame
 from cuspid.model.jaw import Jaw
 from cuspid.model.panorama import Panorama
 from cuspid.model.reconstruction import Reconstruction, Tracks
@@ -23,7 +23,13 @@ from cuspid.model.tolerances import with_cameras
 from cuspid.model.trueness import GroundTruth
 from cuspid.motion.bundle.adjustment import AdjustmentOptions
 from cuspid.motion.monocular.single import SingleOptions
-from cuspid.motion.rig_film import film_options, locate_rig_film, of_camera, refine_rig_on_surface, surface_patches
+from cuspid.motion.rig_film import (
+    film_options,
+    locate_rig_film,
+    refine_rig_on_surface,
+    surface_patches,
+    trajectory_of_camera,
+)
 from cuspid.pipeline.panorama import StitchOptions, stitch_rig
 from cuspid.pipeline.scan import RenderOptions, take_images
 from cuspid.runtime.image_files import read_image
@@ -35,17 +41,24 @@ from verbs import refused, run
 FRAMES = 12
 
 
-@pytest.fixture(scope="module")
-def film(coarse_phantom: Jaw, tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, GroundTruth]:
-    """A small pair of cameras over three teeth of plain enamel, tilting a little."""
-    pair = intra_oral_camera(IntraOralOptions(cameras=2, width_px=320, height_px=240))
-    curve, rng = arch_curve(coarse_phantom), np.random.default_rng(4)
+PAIR = intra_oral_camera(IntraOralOptions(cameras=2, width_px=320, height_px=240))
+
+
+def path_over(jaw: Jaw) -> dict[str, Rigid3]:
+    """Over three teeth, tilting a little."""
+    curve, rng = arch_curve(jaw), np.random.default_rng(4)
     poses = {}
     for index, length in enumerate(np.linspace(12.0, 26.0, FRAMES)):
         shake = Rigid3.from_rotation_vector(np.deg2rad(rng.normal(0, 2.0, 3)), rng.normal(0, 0.3, 3))
         poses[f"{index:03d}"] = shake @ curve.rig_from_world(float(length))
-    folder = tmp_path_factory.mktemp("film")
-    return take_images(coarse_phantom, pair, poses, folder, RenderOptions(texture="enamel", supersampling=1))
+    return poses
+
+
+@pytest.fixture(scope="module")
+def film(coarse_phantom: Jaw, tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, GroundTruth]:
+    """Of a small pair of cameras and plain enamel."""
+    folder, options = tmp_path_factory.mktemp("film"), RenderOptions(texture="enamel", supersampling=1)
+    return take_images(coarse_phantom, PAIR, path_over(coarse_phantom), folder, options)
 
 
 def left_over(found: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -131,6 +144,7 @@ def test_over_the_true_surface_the_path_is_right_and_what_agrees_on_no_poses_cha
     assert refined(AdjustmentOptions(min_angle_deg=89.0)) is None
 
 
+@pytest.mark.long
 def test_pixels_show_what_lies_there_in_true_millimetres(pano: Path, film: tuple[Capture, GroundTruth]) -> None:
     # Which way three teeth look is hardly known; a plane in place of their surface would be off by 0.45 mm.
     assert 0.001 < np.median(left_over(*surface_points(storage.read_panorama(pano), film[1]))) < 0.2
@@ -191,6 +205,7 @@ def test_rolling_shutters_are_taken_into_account(coarse_phantom: Jaw, tmp_path: 
     assert 0.01 < np.percentile(surface, 90) < 0.6
 
 
+@pytest.mark.long
 def test_the_scale_is_that_of_the_handpiece_and_nothing_else(
     pano: Path, film: tuple[Capture, GroundTruth], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -204,10 +219,9 @@ def test_the_scale_is_that_of_the_handpiece_and_nothing_else(
     assert not (tmp_path / "panorama.json").exists()
 
 
-def test_a_frame_that_lacks_an_image_is_left_out_where_it_is_missing(film: tuple[Capture, GroundTruth]) -> None:
-    capture, truth = film
-    rig = capture.handpiece.rig
-    frames = list(capture.frames)
+def test_a_frame_that_lacks_an_image_is_left_out_where_it_is_missing(coarse_phantom: Jaw) -> None:
+    rig, rig_from_world = PAIR.rig, path_over(coarse_phantom)
+    frames = [Frame(name=name, cameras=rig.names) for name in rig_from_world]
     frames[3], frames[5] = (replace(frames[k], cameras=(name,)) for k, name in ((3, "left"), (5, "right")))
     tracks = Tracks(
         points=np.zeros((2, 3)),
@@ -217,17 +231,17 @@ def test_a_frame_that_lacks_an_image_is_left_out_where_it_is_missing(film: tuple
         camera_index=np.array([0, 1, 0, 1]),
         pixels=np.zeros((4, 2)),
     )
-    found = Reconstruction(rig=rig, rig_from_world=truth.rig_from_world, tracks=tracks)
-    beside = cameras_beside(found, frames, [("left", "right")], capture.handpiece)
+    found = Reconstruction(rig=rig, rig_from_world=rig_from_world, tracks=tracks)
+    beside = cameras_beside(found, frames, [("left", "right")], PAIR)
     assert len(beside.pairs) == FRAMES - 2
     assert not {f"{camera}/{frames[k].name}" for k in (3, 5) for camera in rig.names} & set(beside.names)
     for one, other in beside.pairs:
         (first, frame), (second, same) = (beside.names[k].split("/") for k in (one, other))
         assert (first, second, frame) == ("left", "right", same)
-        expected = rig[first].cam_from_rig @ truth.rig_from_world[frame]
+        expected = rig[first].cam_from_rig @ rig_from_world[frame]
         np.testing.assert_array_equal(beside.cam_from_world[one].matrix, expected.matrix)
     with_left = {frame.name for frame in frames if "left" in frame.cameras}
-    model = of_camera(found, "left", with_left)
+    model = trajectory_of_camera(found, "left", with_left)
     assert list(model.frames) == [frame.name for frame in frames if frame.name in with_left]
     assert [model.frames[k] for k in model.tracks.frame_index] == [frames[3].name, frames[6].name]
 

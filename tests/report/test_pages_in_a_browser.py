@@ -20,6 +20,7 @@ from panoramas import stitched_panorama
 from report_folders import tooth_alone, write_comparison, write_scan, write_score, write_shape
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
+pytestmark = pytest.mark.long
 
 ARGUMENTS = (
     "--no-sandbox",
@@ -142,7 +143,6 @@ def fresh(scan: Visit) -> Visit:
     return scan
 
 
-@pytest.mark.long
 def test_the_surface_is_drawn(fresh):
     seen = fresh.picture()
     fresh.press("[data-layer=scan]")
@@ -478,7 +478,6 @@ def write_wide(folder: Path) -> Panorama:
     return wide
 
 
-@pytest.mark.long
 def test_the_thesis_beside_ours_is_read_on_a_phone(browser, tmp_path):
     results = Path(__file__).parents[2] / "benchmarks" / "results"
     cli.main(

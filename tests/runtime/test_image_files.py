@@ -139,10 +139,11 @@ def test_sizes_are_those_of_the_upright_image(tmp_path: Path, name: str, orienta
         assert np.array_equal(back, COLOURS)
 
 
+@pytest.mark.parametrize("image", [SHADES, COLOURS])
 @pytest.mark.parametrize("orientation", [1, 6, 7])
-def test_deep_colours_are_turned_as_others_are(tmp_path: Path, orientation: int) -> None:
-    shallow = turned(tmp_path / "0.png", COLOURS, orientation)
-    deep = write(tmp_path / "1.png", COLOURS.astype(np.uint16) * 257)
+def test_deep_images_are_turned_as_others_are(tmp_path: Path, orientation: int, image: np.ndarray) -> None:
+    shallow = turned(tmp_path / "0.png", image, orientation)
+    deep = write(tmp_path / "1.png", image.astype(np.uint16) * 257)
     donor, data = shallow.read_bytes(), deep.read_bytes()
     at = donor.index(b"eXIf") - 4
     chunk = donor[at : at + 12 + int.from_bytes(donor[at : at + 4], "big")]

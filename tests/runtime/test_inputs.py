@@ -204,5 +204,5 @@ def test_a_calibration_of_opencv_that_is_a_list_or_a_number_is_told(tmp_path: Pa
     file.write_text(f"%YAML:1.0\n---\n{text}")
     for name in ("0", "1"):
         storage.write_image(tmp_path / "frames" / f"{name}.png", image)
-    with pytest.raises(InputError, match="no calibration that is known"):
+    with pytest.raises(InputError, match="no known calibration format"):
         storage.read_sequence(tmp_path / "frames", tmp_path / "out", calibration=file)

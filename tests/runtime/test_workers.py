@@ -9,11 +9,11 @@ import pytest
 from cuspid.runtime.workers import (
     computed_once,
     core_numbers,
-    in_shares,
     map_ahead,
     map_batches,
     map_in_threads,
     map_slices,
+    run_in_shares,
     usable_cores,
 )
 
@@ -110,7 +110,7 @@ def test_a_pinned_thread_takes_smaller_batches_and_one_share():
 
 def shares():
     told = []
-    in_shares(lambda share, of: told.append((share, of)))
+    run_in_shares(lambda share, of: told.append((share, of)))
     return sorted(told)
 
 

@@ -17,10 +17,10 @@ from cuspid.model.room import Room
 from cuspid.model.visibility import VisibilityOptions, scannable_faces, visible_counts
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.detour import _APART, _UNITS, _motion, _shortest, plan_detour
-from cuspid.simulation.path.further import _largest_sum, _Trial, _woven, further_legs, seen_from
+from cuspid.simulation.path.further import _interleave_legs, _largest_sum, _Trial, further_legs, points_seen_from
 from cuspid.simulation.path.legs import Leg, steady_path
 from cuspid.simulation.path.overlap import frame_overlap
-from cuspid.simulation.path.scan import ScanPathOptions, _goes_on, plan_scan_path
+from cuspid.simulation.path.scan import ScanPathOptions, _needs_further_passes, plan_scan_path
 
 HANDPIECE = twelve_cameras()
 
@@ -81,7 +81,7 @@ def test_a_path_around_an_obstacle_fits_and_still_sees(
     steps = np.abs(np.diff(detour.changes, axis=0)) / _UNITS
     assert steps.max() <= 1.7
     middle = crowns.within(np.array([pose.inverse().translation for pose in steady[3:-3]]), 5.0)
-    seen = seen_from(crowns, HANDPIECE, poses).any(axis=0)[middle].mean()
+    seen = points_seen_from(crowns, HANDPIECE, poses).any(axis=0)[middle].mean()
     assert seen > 0.8
 
 
@@ -136,7 +136,7 @@ def test_the_quick_look_agrees_with_rays(coarse_phantom: Jaw, curve: ArchCurve, 
     counts = visible_counts(coarse_phantom.mesh, HANDPIECE, poses, VisibilityOptions(), among)
     assert not counts[~among].any()
     _, faces, _ = coarse_phantom.mesh.closest(crowns.points)
-    quick, exact = seen_from(crowns, HANDPIECE, poses).any(axis=0), counts[faces] >= 2
+    quick, exact = points_seen_from(crowns, HANDPIECE, poses).any(axis=0), counts[faces] >= 2
     assert 0.2 < exact.mean() < 0.8
     assert (quick == exact).mean() > 0.95
 
@@ -177,7 +177,7 @@ def test_further_passes_are_gone_through_on_the_way_without_jumps() -> None:
     base = (Leg(roll_deg=0.0, start_mm=0.0, end_mm=100.0),)
     wanted = ((30.0, 20.0, 40.0), (-30.0, 25.0, 45.0), (45.0, 85.0, 99.0))
     further = [Leg(roll_deg=roll, start_mm=low, end_mm=high) for roll, low, high in wanted]
-    legs = list(_woven(base, further))
+    legs = list(_interleave_legs(base, further))
     assert sum(leg.length_mm for leg in legs if leg.roll_deg == 0) == pytest.approx(100)
     assert sorted(leg.roll_deg for leg in legs if leg.roll_deg) == [-30, 30, 45]
     rolls = [leg.roll_deg for leg in legs]
@@ -197,9 +197,9 @@ def test_further_passes_see_more_and_never_less(coarse_phantom: Jaw, curve: Arch
     assert len(further.legs) > 1
     assert further.legs[0].roll_deg == 0
     before, after = (
-        seen_from(crowns, HANDPIECE, [path.rig_from_world(float(at)) for at in np.arange(*path.span_mm, 1.5)]).any(
-            axis=0
-        )
+        points_seen_from(
+            crowns, HANDPIECE, [path.rig_from_world(float(at)) for at in np.arange(*path.span_mm, 1.5)]
+        ).any(axis=0)
         for path in (first, further)
     )
     assert after.mean() > before.mean() + 0.005
@@ -219,13 +219,13 @@ def test_further_passes_see_more_and_never_less(coarse_phantom: Jaw, curve: Arch
     ],
 )
 def test_a_whole_arch_of_which_nothing_is_said_is_gone_over_again(curve: ArchCurve, said: dict, again: bool) -> None:
-    assert _goes_on(ScanPathOptions(**said), curve) == again
+    assert _needs_further_passes(ScanPathOptions(**said), curve) == again
 
 
 def test_a_part_is_not(coarse_phantom: Jaw) -> None:
     part = arch_curve(part_of(coarse_phantom, (44, 45, 46, 47)))
-    assert not _goes_on(ScanPathOptions(), part)
-    assert _goes_on(ScanPathOptions(passes="auto"), part)
+    assert not _needs_further_passes(ScanPathOptions(), part)
+    assert _needs_further_passes(ScanPathOptions(passes="auto"), part)
 
 
 def test_the_plan_tells_the_share_of_the_open_crowns_that_a_comparison_counts(coarse_phantom: Jaw) -> None:

@@ -52,7 +52,7 @@ def test_a_plane_is_not_hollow_and_a_groove_is() -> None:
 @pytest.fixture(scope="module")
 def marked(coarse_phantom: Jaw) -> list[np.ndarray]:
     """Shares of each mark, by seed."""
-    return [natural_marks(coarse_phantom, seed).shares for seed in range(12)]
+    return [natural_marks(coarse_phantom, seed).shares for seed in range(8)]
 
 
 @pytest.mark.long

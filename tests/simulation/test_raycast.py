@@ -10,7 +10,7 @@ import pytest
 
 from builders import SavedImages, sphere
 from cuspid.geometry import Rigid3
-from cuspid.geometry.gloss import coat, leaving
+from cuspid.geometry.gloss import coat, transmittance
 from cuspid.handpiece.designs import DesignOptions, twelve_cameras
 from cuspid.model.camera import Camera
 from cuspid.model.capture import Frame
@@ -191,7 +191,7 @@ def test_less_light_leaves_a_clear_surface_at_grazing_angles() -> None:
     matte_image, clear_image = (light_seen(jaw, probe(led(x=2.0), camera=wide), look) for look in (PLAIN, clear))
     rays = wide.rays(wide.pixel_centres().reshape(-1, 2))
     cosines = (1 / np.linalg.norm(rays, axis=-1)).reshape(matte_image.shape)
-    expected = np.vectorize(leaving)(cosines, 1.5)
+    expected = np.vectorize(transmittance)(cosines, 1.5)
     assert expected.min() < 0.95
     np.testing.assert_allclose(clear_image / matte_image, expected, rtol=1e-4)
 
@@ -286,10 +286,11 @@ def test_presets_differ_in_contrast_and_seeds_in_pattern() -> None:
 def test_a_sprayed_texture_suits_the_cameras_and_enamel_stays_enamel() -> None:
     for footprint_mm, factor in ((0.0117, 1), (0.003, 1), (0.053, 1), (0.1, 8), (0.0015, 0.125), (12.0, 1024)):
         for name in ("artificial", "powder"):
-            before, after = APPEARANCES[name].gum, APPEARANCES[name].seen_by(footprint_mm).gum
+            before, after = APPEARANCES[name].gum, APPEARANCES[name].at_footprint(footprint_mm).gum
             assert after.wavelengths_mm == tuple(factor * wavelength for wavelength in before.wavelengths_mm)
         assert (
-            APPEARANCES["enamel"].seen_by(footprint_mm).gum.wavelengths_mm == APPEARANCES["enamel"].gum.wavelengths_mm
+            APPEARANCES["enamel"].at_footprint(footprint_mm).gum.wavelengths_mm
+            == APPEARANCES["enamel"].gum.wavelengths_mm
         )
 
 

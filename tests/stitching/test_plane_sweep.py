@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid.geometry import Rigid3
-from cuspid.geometry.gloss import leaving
+from cuspid.geometry.gloss import transmittance
 from cuspid.model.camera import Camera
 from cuspid.model.reconstruction import Tracks
 from cuspid.model.sparse_model import SparseModel
@@ -219,6 +219,7 @@ def test_cameras_of_one_instant_find_the_step_however_bright_they_show_it(scene:
     assert np.percentile(np.abs(found.interpolate(grid((4.2, 6.0))) + DEEP_MM), 90) < 0.4
 
 
+@pytest.mark.long
 def test_a_plain_spot_in_a_crown_is_bridged(scene: Scene) -> None:
     """Nothing agrees there, as where a highlight goes over a smooth hollow."""
     spot = np.array([0.0, -3.0])
@@ -307,6 +308,7 @@ def test_the_mosaic_shows_each_place_once(scene: Scene, mosaic: Mosaic) -> None:
     assert np.nanpercentile(off, 95) < 0.5
 
 
+@pytest.mark.long
 def test_a_film_of_another_scale_needs_no_more_cells(scene: Scene, surface: HeightMap) -> None:
     """A wrong scale makes the arch ten times larger; so are its pixels."""
     motion = scene.motion.scaled(10.0)
@@ -429,7 +431,7 @@ def instants(index: float, paint: Callable[[np.ndarray], np.ndarray]) -> Scene:
             turn = Rigid3.from_rotation_vector(np.array([0.0, np.arctan2(x, CAMERA_MM), 0]), np.zeros(3))
             pose = turn @ down @ place
             places, cosines = on_hill(pose, CAMERA)
-            light = paint(places) * np.vectorize(leaving)(np.clip(np.nan_to_num(cosines), 0.1, 1), index)
+            light = paint(places) * np.vectorize(transmittance)(np.clip(np.nan_to_num(cosines), 0.1, 1), index)
             gray = np.where(np.abs(places[..., 0]) < RIM_MM, 255 * np.clip(light, 0, 1) ** (1 / 2.2), 0)
             poses[f"{name}/{instant}"] = pose
             images[f"{name}/{instant}"] = np.dstack([np.rint(gray).astype(np.uint8)] * 3)

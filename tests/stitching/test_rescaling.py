@@ -84,9 +84,9 @@ def test_the_notes_tell_where_the_scale_is_from_and_what_does_not_fit() -> None:
     lengths = [apart(shown, np.array(FAR)), apart(shown, near)]
     fits = rescale_panorama(shown, [distance(*FAR, 2 * lengths[0]), distance(*near, 2.04 * lengths[1])]).panorama.notes
     assert "smaller by a factor of 2.0" in fits[0]
-    assert fits[1:] == ("the path is held loosely at frame 7",)
+    assert fits[1:] == ("the path is weakly constrained at frame 7",)
     off = rescale_panorama(shown, [distance(*FAR, 2 * lengths[0]), distance(*near, 3 * lengths[1])]).panorama.notes
-    assert sum("look whether the places" in note for note in off) == 2
+    assert sum("check the places" in note for note in off) == 2
     larger = rescale_panorama(shown, [distance(*FAR, lengths[0] / 1.25)]).panorama.notes[0]
     assert "larger by a factor of 1.2500" in larger
     assert f"is {100 * 0.1 / (lengths[0] / 1.25):.2g} % of all lengths" in larger
@@ -172,7 +172,7 @@ def test_several_distances_are_given_one_after_the_other(tmp_path: Path, capsys:
     measured = ("--distance", 3, 4, 36, 22, 40.0, "--distance", 20, 3, 22, 27, 20.0)
     run("pano", "rescale", tmp_path / "pano", "--out", tmp_path / "out", *measured)
     assert len(json.loads((tmp_path / "out" / "distances.json").read_text())["distances"]) == 2
-    assert "look whether the places" in capsys.readouterr().err.replace("\n", " ")
+    assert "check the places" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_the_page_of_a_killed_run_names_its_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

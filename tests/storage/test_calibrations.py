@@ -19,7 +19,7 @@ from cuspid.geometry.cameras import GRID
 from cuspid.model.camera import Camera
 from cuspid.model.rig import MountedCamera, Rig
 from cuspid.runtime.errors import CuspidError, InputError, OutputError
-from cuspid.storage.calibrations import FORMATS, carried_over, read_calibration, write_calibration
+from cuspid.storage.calibrations import FORMATS, fit_to_format, read_calibration, write_calibration
 from verbs import refused, run
 
 POINTS = np.stack(np.meshgrid(np.linspace(-25, 25, 5), np.linspace(-20, 20, 5), [70.0, 90.0]), -1).reshape(-1, 3)
@@ -602,7 +602,7 @@ def rig_of(count: int, model: str = "OPENCV") -> Rig:
 @pytest.mark.parametrize("kind", [name for name, each in FORMATS.items() if each.write is not None])
 def test_what_is_written_is_read_again(tmp_path: Path, kind: str, model: str) -> None:
     rig = rig_of(min(3, FORMATS[kind].max_cameras or 3), model)
-    carried = carried_over(rig, kind)
+    carried = fit_to_format(rig, kind)
     path = tmp_path / f"it{SUFFIXES.get(kind, '.json')}"
     write_calibration(path, carried.rig, kind)
     read = read_calibration(path)
@@ -618,11 +618,11 @@ def test_what_is_written_is_read_again(tmp_path: Path, kind: str, model: str) ->
 def test_covariances_and_names_that_are_lost_are_told() -> None:
     camera = rig_of(1)["c0"].camera
     known = MountedCamera(camera, Rigid3.identity(), np.eye(6))
-    notes = carried_over(Rig({"a": known, "b": known}), "kalibr").notes
+    notes = fit_to_format(Rig({"a": known, "b": known}), "kalibr").notes
     assert any("covariances" in note for note in notes)
     assert any("a, b" in note for note in notes)
     with pytest.raises(OutputError, match="at most"):
-        carried_over(rig_of(3), "ros")
+        fit_to_format(rig_of(3), "ros")
 
 
 def test_a_lens_that_cannot_be_carried_over_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -656,10 +656,10 @@ def test_a_splined_lens_is_kept_by_handpieces_alone(tmp_path: Path, capsys: pyte
         model="SPLINED_FISHEYE",
     )
     rig = Rig({"a": MountedCamera(camera, Rigid3.identity())})
-    assert carried_over(rig, "handpiece").rig["a"].camera is camera
+    assert fit_to_format(rig, "handpiece").rig["a"].camera is camera
     write_calibration(tmp_path / "handpiece.json", rig, "handpiece", 10.0)
     for kind in ("colmap-rig", "opencv", "kalibr"):
-        lost = carried_over(rig, kind).losses["a"]
+        lost = fit_to_format(rig, kind).losses["a"]
         assert 2 < lost.rms_px < lost.largest_px < 20
         target = tmp_path / f"x{SUFFIXES.get(kind, '.json')}"
         line = refused(capsys, "rig", "convert", tmp_path / "handpiece.json", target, "--to", kind)
@@ -701,7 +701,7 @@ def test_convert_writes_a_handpiece(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "is the file that is read" in refused(capsys, "rig", "convert", tmp_path / "pair.yml", tmp_path / "pair.yml")
     write(tmp_path, "other.yml", "a: 1\n")
     told = refused(capsys, "rig", "convert", tmp_path / "other.yml", tmp_path / "x.json")
-    assert "cuspid rig convert takes it with --from" in told
+    assert "name it with cuspid rig convert --from" in told
 
 
 _JUNK = st.recursive(

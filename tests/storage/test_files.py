@@ -201,7 +201,9 @@ def test_a_rig_config_serves_as_a_handpiece(tmp_path, caplog):
 
 def test_a_working_distance_that_cannot_be_known_or_is_known_is_told(tmp_path):
     storage.write_rig_config(tmp_path / "rig_config.json", handpiece("a").rig)
-    with pytest.raises(InputError, match=r"rig_config.json: the working distance cannot be told .*; give a handpiece"):
+    with pytest.raises(
+        InputError, match=r"rig_config.json: the working distance cannot be inferred .*; give a handpiece"
+    ):
         storage.read_handpiece(tmp_path / "rig_config.json")
     storage.write_handpiece(tmp_path / "handpiece.json", handpiece("a"))
     with pytest.raises(InputError, match="already has a working distance"):

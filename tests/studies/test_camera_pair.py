@@ -13,7 +13,7 @@ from cuspid.studies.camera_pair import (
     best_pairs,
     camera_pair,
     convergence_deg,
-    facing,
+    pose_facing,
     study_camera_pair,
     table,
     tooth_surfaces,
@@ -57,7 +57,7 @@ def test_the_axes_meet_where_the_convergence_is_their_angle(baseline, angle):
 @pytest.mark.parametrize("surface", ["occlusal", "buccal", "lingual"])
 def test_a_pair_faces_the_middle_of_a_surface_from_outside(coarse_phantom, surface):
     mesh, mask = coarse_phantom.mesh, tooth_surfaces(coarse_phantom, 47)[surface]
-    pose = facing(mesh, mask, np.array([1.0, 0.2, 0.3]), 6.0)
+    pose = pose_facing(mesh, mask, np.array([1.0, 0.2, 0.3]), 6.0)
     middle = np.average(mesh.face_centres[mask], axis=0, weights=mesh.face_areas[mask])
     np.testing.assert_allclose(pose.apply(middle), [0, 0, 6], atol=1e-9)
     assert np.linalg.det(pose.rotation) == pytest.approx(1)

@@ -18,9 +18,9 @@ from cuspid.studies import camera_sweep, grid
 from cuspid.studies.camera_sweep import (
     SweepOptions,
     best_setting,
+    clear_path,
     contenders,
     find_site,
-    held_clear,
     pair_handpiece,
     surface_faces,
     sweep,
@@ -44,7 +44,7 @@ def site(coarse_phantom):
 def swept(coarse_phantom, tmp_path_factory):
     """A real sweep of two cases, its folder and its progress."""
     folder, seen = tmp_path_factory.mktemp("sweep"), []
-    outcomes = sweep(coarse_phantom, folder, SMALL, workers=2, progress=lambda *at: seen.append(at))
+    outcomes = sweep(coarse_phantom, folder, SMALL, workers=1, progress=lambda *at: seen.append(at))
     return outcomes, folder, seen
 
 
@@ -99,15 +99,15 @@ def test_a_pair_that_hardly_touches_is_moved_a_little_and_one_that_is_in_the_way
     handpiece, poses = pair_handpiece(site.pair_from_rig, (2.0, 0.0), SMALL), site.rig_from_world[0]
     free = Room(site.jaw.mesh, handpiece.solid, SMALL.path.clearance_mm)
     nearest_mm = min(free.clearance(pose)[0] for pose in poses.values())
-    assert held_clear(replace(free, clearance_mm=nearest_mm - 0.01), poses, site.pair_from_rig, SMALL) == dict(poses)
+    assert clear_path(replace(free, clearance_mm=nearest_mm - 0.01), poses, site.pair_from_rig, SMALL) == dict(poses)
     tight = replace(free, clearance_mm=nearest_mm + 0.1)
-    held = held_clear(tight, poses, site.pair_from_rig, SMALL)
+    held = clear_path(tight, poses, site.pair_from_rig, SMALL)
     assert list(held) == list(poses)
     assert tight.fits_at(list(held.values())).all()
     moved = [np.linalg.norm(held[name].matrix - poses[name].matrix) for name in poses]
     assert 0.05 < max(moved) < 0.6
     with pytest.raises(InputError, match=r"mm of the jaw, but must keep"):
-        held_clear(replace(free, clearance_mm=nearest_mm + 2.0), poses, site.pair_from_rig, SMALL)
+        clear_path(replace(free, clearance_mm=nearest_mm + 2.0), poses, site.pair_from_rig, SMALL)
 
 
 @settings(max_examples=20)
@@ -184,7 +184,7 @@ def test_a_killed_sweep_goes_on(coarse_phantom, swept, tmp_path, monkeypatch):
     kept = outcomes[0].case.name
     shutil.copy(folder / "cases" / f"{kept}.json", tmp_path / "cases")
     ran = []
-    monkeypatch.setattr("cuspid.studies.grid._in_processes", lambda cases, work, workers: ran.extend(cases) or [])
+    monkeypatch.setattr("cuspid.studies.grid._run_in_processes", lambda cases, work, workers: ran.extend(cases) or [])
     with pytest.raises(KeyError):
         sweep(coarse_phantom, tmp_path, SMALL)
     assert [case.name for case in ran] == [outcomes[1].case.name]
@@ -206,7 +206,7 @@ def test_contenders_are_repeated_with_other_seeds(coarse_phantom, tmp_path, monk
 
     monkeypatch.setattr(camera_sweep, "sweep_case", invented)
     monkeypatch.setattr(
-        "cuspid.studies.grid._in_processes",
+        "cuspid.studies.grid._run_in_processes",
         lambda cases, work, workers: [grid._attempt(work, case) for case in cases],
     )
     options = SweepOptions(

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cuspid import storage
-from cuspid.cli import main
+from cuspid.anatomy.mouth import study_mouths
+from cuspid.cli import comparison, main
 from cuspid.evaluation.deviation import EvaluationOptions
 from cuspid.geometry import Rigid3
 from cuspid.handpiece.designs import DesignOptions, essential_four, six_cameras, twelve_cameras
@@ -231,8 +232,10 @@ def test_a_scan_is_simulated_reconstructed_and_evaluated(files, tmp_path):
     assert figures["tooth_within_50_um_pct"] <= figures["tooth_within_100_um_pct"] < figures["tooth_seen_pct"] + 15
 
 
-def test_the_verb_shows_what_is_done_without_scanning_again(files, tmp_path, capsys):
-    out = tmp_path / "comparison"
+def test_the_verb_shows_what_is_done_without_scanning_again(files, tmp_path, capsys, monkeypatch):
+    out, drawn = tmp_path / "comparison", []
+    save = comparison.save_comparison_picture
+    monkeypatch.setattr(comparison, "save_comparison_picture", lambda *of, **how: [drawn.append(of), save(*of, **how)])
     compare = [
         "study",
         "compare",
@@ -260,6 +263,8 @@ def test_the_verb_shows_what_is_done_without_scanning_again(files, tmp_path, cap
     assert (out / "comparison.md").read_text().count("| jaw | 46 | tiny |") == 4
     for name in ("comparison.png", "surfaces.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
+    second_molars_mm = study_mouths()[1]["women"].gap_mm[:, 6]
+    assert np.mean(second_molars_mm > drawn[0][3]) == pytest.approx(0.95, abs=0.002)
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,8 @@ from cuspid.runtime.errors import InputError
 from cuspid.studies.scanners.files import find_files, without_repeats
 from cuspid.studies.scanners.scan import StudyOptions
 from cuspid.studies.scanners.soundness import count_cuts, cut_notes, mend_faces
-from cuspid.studies.scanners.specimen import guessed_unit, load_specimen
-from cuspid.studies.scanners.study import Intake, compare, foreseen, measure_share, prepare
+from cuspid.studies.scanners.specimen import guess_unit, load_specimen
+from cuspid.studies.scanners.study import Intake, compare, measure_share, plan_comparison, prepare
 from cuspid.studies.scanners.summary import Group, difference_um, group_row, region_of
 from horseshoe import horseshoe, without_base
 from verbs import refused, run
@@ -148,12 +148,12 @@ def test_the_same_file_twice_counts_once(tmp_path):
 @pytest.mark.parametrize(("per_mm", "unit"), [(1.0, "mm"), (0.1, "cm"), (0.001, "m"), (1 / 25.4, "in"), (1000.0, "um")])
 def test_the_unit_of_a_file_is_told_by_its_reference(tmp_path, jaw, per_mm, unit):
     put(tmp_path, "a.stl", Mesh(jaw.mesh.vertices * per_mm, jaw.mesh.faces))
-    found, odd = guessed_unit(tmp_path / "a.stl", storage.read_mesh(tmp_path / "a.stl"), like_mm=60.0)
+    found, odd = guess_unit(tmp_path / "a.stl", storage.read_mesh(tmp_path / "a.stl"), like_mm=60.0)
     assert found == unit
     assert (odd is None) == (unit == "mm")
     put(tmp_path, "b.stl", Mesh(jaw.mesh.vertices * 25.4, jaw.mesh.faces))
-    with pytest.raises(InputError, match="no size of teeth or jaws"):
-        guessed_unit(tmp_path / "b.stl", storage.read_mesh(tmp_path / "b.stl"), like_mm=60.0)
+    with pytest.raises(InputError, match="not the size of teeth or jaws"):
+        guess_unit(tmp_path / "b.stl", storage.read_mesh(tmp_path / "b.stl"), like_mm=60.0)
 
 
 # --- odd triangles ----------------------------------------------------------------------------------------------------
@@ -307,7 +307,7 @@ def test_known_errors_come_back_and_the_rest_is_left_out(tmp_path, jaw, specimen
     put(tmp_path, "Scan ñ 2/m/two fold é.stl", Mesh(twofold.vertices, np.concatenate([twofold.faces] * 2)))
     out = tmp_path / "out"
     prepared = prepare(tmp_path, out, QUICK, Intake())
-    told_before = [str(remark) for remark in foreseen(prepared, out, QUICK)]
+    told_before = [str(remark) for remark in plan_comparison(prepared, out, QUICK)]
     found = compare(prepared, out, QUICK)
     assert told_before == [str(remark) for remark in found.remarks]
     assert "Scan ñ 2/m/two fold é: every face is there twice; one of each is used" in told_before

@@ -56,7 +56,7 @@ def stitched_panorama(*, mm_per_px: float | None = 0.03, seed: int = 3) -> Panor
         origin_px=np.array([12.5, 31.0]),
         mm_per_px=mm_per_px,
         height_mm=rng.normal(0, 5 * (mm_per_px or 1), (HEIGHT, WIDTH)).astype(np.float32),
-        notes=("the scale assumes a camera held 14 mm over the teeth", "the path is held loosely at frame 7"),
+        notes=("the scale assumes a camera held 14 mm over the teeth", "the path is weakly constrained at frame 7"),
     )
 
 

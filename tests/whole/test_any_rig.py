@@ -259,13 +259,17 @@ def test_a_longer_lens_gives_the_same_scan_of_smaller_hills(folder: Path) -> Non
 @pytest.mark.parametrize("factor", FACTORS)
 def test_a_larger_rig_is_taken_to_be_as_well_known_for_its_size(factor: float) -> None:
     given, options = scan().handpiece, ReconstructionOptions()
-    found, expected = pipeline.as_known(times(given, factor), options), times(pipeline.as_known(given, options), factor)
+    found, expected = (
+        pipeline.apply_uncertainty(times(given, factor), options),
+        times(pipeline.apply_uncertainty(given, options), factor),
+    )
     for one, other in zip(found.rig.cameras.values(), expected.rig.cameras.values(), strict=True):
         assert np.allclose(one.covariance, other.covariance, rtol=1e-12, atol=0)
         assert np.array_equal(one.camera.covariance, other.camera.covariance)
         assert other.covariance.any()
 
 
+@pytest.mark.long
 def test_a_larger_rig_is_calibrated_alike() -> None:
     capture, factor = scan(), 1000.0
     given = uncertain(capture.handpiece)
@@ -362,6 +366,7 @@ def test_order_and_names_do_not_change_the_scan(change: str, folder: Path) -> No
     check_mesh(mesh, reference)
 
 
+@pytest.mark.long
 def test_a_draft_is_the_same_scan_at_a_glance(folder: Path) -> None:
     """The same frames at about the same places, and the same surface in fewer faces, less exactly."""
     shown = dict[str, tuple[int, int]]()

@@ -297,13 +297,24 @@ def test_figures_are_put_into_a_page_wherever_its_lines_are_broken(freshness):
         ("a: x/*/y .2f rms", "4.97"),
         ("a: x/p/y & a: x/q/y .0f", "1-3"),
         ("a: x/r/y .0f", "8"),
+        ("a: x/r/y .1e * 0.01", "8.0e-02"),
+        ("a: x/*/y ,.0f mean * 1000", "4,000"),
+        ("a: x/*/y .2f sd", "3.61"),
+        ("a: x/*/of=q/y +.0f", "-3"),
+        ("a: x/r/0/y .0f", "8"),
+        ("a: x/q/row/1 .0f", "5"),
+        ("a: x/s .0f", "2-6"),
+        ("a: x/*/y <= 3 count", "2"),
         ("a: x/*/y >= 1 and a: x/r/y <= 8", "met"),
         ("a: x/*/y >= 1 and a: x/r/y <= 7.9", "missed"),
     ],
 )
 def test_what_a_source_says(freshness, source, told):
-    results = {"a": {"x": {"p": {"y": 1}, "q": {"y": -3}, "r": [{"y": 8}, {"y": None}]}}}
-    assert import_module("quoted").with_figures("so {}.", {"so {}.": [source]}, results) == f"so {told}."
+    results = {
+        "a": {"x": {"p": {"y": 1}, "q": {"y": -3, "of": "q", "row": "4 5"}, "r": [{"y": 8}, {"y": None}], "s": [2, 6]}}
+    }
+    for page in ("so 9.99.", f"so {told}."):
+        assert import_module("quoted").with_figures(page, {"so {}.": [source]}, results) == f"so {told}."
 
 
 @pytest.mark.parametrize(
@@ -313,14 +324,37 @@ def test_what_a_source_says(freshness, source, told):
         ("a 1; a 2;", {}, "2 times on the page"),
         ("a 1;", {"a {};": ["b: x .1f"]}, "no result has b: x"),
         ("a 1;", {"a {};": ["a: z .1f"]}, "no result has a: z"),
+        ("a 1;", {"a {};": ["a: word .1f"]}, "no result has a: word"),
         ("a 1;", {"a {};": ["a: x"]}, "neither a figure nor a bar"),
         ("a 1;", {"a {};": []}, "0 sources"),
         ("a 1;", {"a {}": ["a: x .1f"]}, "words at its end"),
         ("| h |\n|---|\n| a 1; |\n| words |\n| b 2; |\n", {}, "| b 2; |: not in quoted.toml"),
+        ("a 1; and 3 µm", {}, "... and 3 µm (3 µm): measured, but neither"),
+        ("a 1; at commit 12345ab\n- 3\n  µm\n", {}, "- 3 µm (3 µm): measured, but neither"),
+        ("a 1;\n\n| b | s |\n|---|---|\n| c | 3 |\n", {}, "| b | s | |---|---|"),
+        ("a 1;\n<!-- given -->\n## B\n3 s\n### C\n4 s\n## D\n5 s\n", {}, "5 s (5 s): measured"),
+        ("a 1;\n<!-- given -->\n3 s\n\n4 s\n", {}, "4 s (4 s): measured"),
+        ("a 1;\n\n<!-- given --> 3 s\n", {}, "3 s (3 s): measured"),
     ],
 )
 def test_a_figure_without_a_result_is_refused(freshness, page, changed, said):
     quoted = import_module("quoted")
     with pytest.raises(quoted.WrongFigureError) as caught:
-        quoted.with_figures(page, changed or {"a {};": ["a: x .1f"]}, {"a": {"x": 1}})
+        quoted.with_figures(page, changed or {"a {};": ["a: x .1f"]}, {"a": {"x": 1, "word": "1"}})
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "3 µm, commit 12345ab",
+        "3 % off (`tests/room/test_it.py`)",
+        "At commit 12345ab:\n\n| b | s |\n|---|---|\n| c | 3 |\n",
+        "## B\n\n3 words, `--option 3 s`\n\n```sh\nrun 3 s\n```",
+        "3 s <!-- given -->",
+        "<!-- given -->\n## B\n3 s\n\n| b | s |\n|---|---|\n| c | 3 |\n",
+    ],
+)
+def test_a_figure_that_is_dated_or_given_needs_no_result(freshness, text):
+    page = f"a 1;\n\n{text}\n"
+    assert import_module("quoted").with_figures(page, {"a {};": ["a: x .0f"]}, {"a": {"x": 1}}) == page

@@ -227,6 +227,6 @@ def test_files_of_another_kind_are_not_written_over(tmp_path: Path, capsys: pyte
     before = mesh.read_bytes()
     assert "ends in .html or .htm" in refused(capsys, "report", tmp_path, "--out", mesh)
     assert "ends in .csv" in refused(capsys, "rig", "optics", "--out", mesh)
-    assert "no jaw that cuspid wrote" in refused(capsys, "jaw", "phantom", "--edge-mm", 2, "--out", mesh)
+    assert "was not written by cuspid" in refused(capsys, "jaw", "phantom", "--edge-mm", 2, "--out", mesh)
     assert mesh.read_bytes() == before
     run("rig", "optics", "--out", tmp_path / "table.csv")

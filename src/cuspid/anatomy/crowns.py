@@ -1,4 +1,4 @@
-"""Crowns told from gum: by tooth labels, or by shape where a jaw has none, which is an estimate.
+"""Separates crowns from gum: by tooth labels, or by shape where a jaw has none, which is an estimate.
 
 By shape, a random walker (Grady 2006) on the surface finds for each place whether a walk from there ends sooner on
 crown or on gum. It hardly crosses furrows, and where crowns meet the gum a furrow runs. A walk ends
@@ -63,7 +63,7 @@ class Crowns:
     faces: Bool[np.ndarray, "f"]
     """Faces of crowns; the others are gum or base."""
     estimated: bool
-    """Whether they were told from gum by shape."""
+    """Whether they were separated from gum by shape."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "faces", read_only(self.faces))
@@ -83,15 +83,15 @@ def crowns_by_shape(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     if look is None:
         return np.zeros(len(mesh.faces), dtype=bool)
     pairs = np.unique(np.sort(edges_of(walked.faces), axis=1), axis=0)
-    share = _without_specks(_share_on_crown(walked, pairs, look), pairs, walked.vertex_areas)
+    share = _remove_specks(_share_on_crown(walked, pairs, look), pairs, walked.vertex_areas)
     by_face = share[walked.faces].mean(axis=1)
     return np.asarray((by_face if walked is mesh else by_face[walked.closest(mesh.face_centres)[1]]) > _LEAST_SHARE)
 
 
 def _simplify(mesh: Mesh, face_mm2: float) -> Mesh:
     """With faces of that mean area, or the mesh itself where its own are about as large."""
-    wanted = max(int(mesh.face_areas.sum() / face_mm2), 100)
-    return mesh if len(mesh.faces) <= 1.3 * wanted else mesh.simplified(wanted)
+    face_count = max(int(mesh.face_areas.sum() / face_mm2), 100)
+    return mesh if len(mesh.faces) <= 1.3 * face_count else mesh.simplified(face_count)
 
 
 # --- how places look --------------------------------------------------------------------------------------------------
@@ -111,7 +111,7 @@ class _Look:
 
 def _look(mesh: Mesh, coarse: Mesh) -> _Look | None:
     """None where nothing looks like the top of a crown."""
-    normals, furrow_mm = _near_by(mesh)
+    normals, furrow_mm = _local_relief(mesh)
     protrusion_mm = _protrusion_mm(mesh, coarse, normals)
     summit_mm = _summit_mm(mesh)
     below_mm = summit_mm - mesh.vertices[:, 2]
@@ -139,7 +139,7 @@ def _likelihood(
     return 1 / (1 + np.exp(-np.clip(score, -30, 30)))
 
 
-def _near_by(mesh: Mesh) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v"]]:
+def _local_relief(mesh: Mesh) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v"]]:
     """Smoothed unit normals, and how far the surface within `_FURROW_REACH_MM` lies above each vertex, mm."""
     pairs = cKDTree(mesh.vertices).query_pairs(_FURROW_REACH_MM, output_type="ndarray")
     i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
@@ -210,7 +210,7 @@ def _laplacian(pairs: Int[np.ndarray, "e 2"], hollow_per_mm: Float[np.ndarray, "
     return csr_array(diags_array(both.sum(axis=1)) - both)
 
 
-def _without_specks(
+def _remove_specks(
     share: Float[np.ndarray, "v"], pairs: Int[np.ndarray, "e 2"], areas: Float[np.ndarray, "v"]
 ) -> Float[np.ndarray, "v"]:
     """Specks of crown become gum, then those of gum crown."""

@@ -47,11 +47,17 @@ class Labelling:
         """The labels of a file in FDI numbers, for its mesh in the occlusal frame; see :func:`number_teeth`."""
         table = None if self.label_map is None else read_label_map(self.label_map)
         return number_teeth(
-            str(path), labels, mesh, arch=arch or named_arch(path), sure=sure, numbering=self.numbering, label_map=table
+            str(path),
+            labels,
+            mesh,
+            arch=arch or arch_from_name(path),
+            sure=sure,
+            numbering=self.numbering,
+            label_map=table,
         )
 
 
-def named_arch(path: Path) -> Arch | None:
+def arch_from_name(path: Path) -> Arch | None:
     """The arch that the name of a file says: ``lower`` or ``upper`` stands in it."""
     named = [arch for arch in ARCHES if arch in path.stem.lower()]
     return named[0] if len(named) == 1 else None
@@ -106,7 +112,7 @@ def _load_oriented(
         labels = number_regions(regions, moved, arch)
         if labels is None and needs_teeth:
             raise InputError(
-                f"{path}: its colours tell {regions.max()} teeth, but these are not one row without a gap, so they "
+                f"{path}: its colours separate {regions.max()} teeth, but these are not one row without a gap, so they "
                 f"cannot be numbered; {_GIVE_LABELS}"
             )
     return Jaw(mesh=moved, face_labels=labels, arch=arch), notes, occlusal.occlusal_from_mesh
@@ -123,7 +129,8 @@ def _require_teeth(
         raise InputError(f"{path}: it has neither landmarks nor tooth labels{colors}; {_GIVE_LABELS}")
     if arch is None:
         raise InputError(
-            f"{path}: its colours tell {regions.max()} teeth, but not whether they are lower or upper ones; give --arch"
+            f"{path}: its colours separate {regions.max()} teeth, but do not show whether they are lower or upper; "
+            f"give --arch"
         )
 
 
@@ -151,13 +158,13 @@ def load_landmarked_jaw(
     labels, where it has any.
 
     A file ``<name>.landmarks.json`` or ``<name>.mrk.json`` beside the mesh is found by itself. ``lower`` or ``upper``
-    in the name of the mesh tells the arch where nothing else does. Raises InputError for a landmark that the scheme or
+    in the name of the mesh gives the arch where nothing else does. Raises InputError for a landmark that the scheme or
     the jaw does not know, and where there are neither landmarks nor labels.
     """
     beside = (path.with_suffix(suffix) for suffix in (".landmarks.json", MARKUPS_SUFFIX))
     file = landmarks or next((each for each in beside if is_there(each)), None)
     jaw, notes, occlusal_from_mesh = _load_oriented(
-        path, unit, arch or named_arch(path), labelling, needs_teeth=file is None
+        path, unit, arch or arch_from_name(path), labelling, needs_teeth=file is None
     )
     if file is not None:
         given = read_landmarks(file)

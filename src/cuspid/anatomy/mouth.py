@@ -508,7 +508,7 @@ def _assumptions(options: MouthOptions) -> tuple[str, ...]:
         f"a handpiece fits at a tooth if thickness, working distance and clearance are at most the {judged} at the "
         "tooth's distal end; the gap grows forwards, so that is the narrowest place along a handpiece that comes in "
         "from the front",
-        f"the mouth is open to {options.held:.0%} of its maximum; nobody holds all of it for long",
+        f"the mouth is open to {options.held:.0%} of its maximum; nobody keeps it fully open for long",
         "healthy adults; teeth count as points of the occlusal planes; cheeks, tongue, lips and the curve of Spee are "
         "left out",
         "all values are normal and independent of each other"
@@ -566,8 +566,11 @@ def _angle_line(angles: tuple[float, ...], narrow: Mouth) -> ThesisLine:
 
 def _depth_line(angles: tuple[float, ...]) -> ThesisLine:
     length = _ARCH_LENGTHS_MM["Lower-14"]
-    printed = _projected_mm(angles, length)
-    exact = [_distance_mm(radius, angle, length) for radius, angle in zip(_RADII_MM, angles, strict=True)]
+    printed = _projection_mm(angles, length)
+    exact = [
+        float(np.sqrt(radius**2 + length**2 - 2 * radius * length * np.cos(angle)))
+        for radius, angle in zip(_RADII_MM, angles, strict=True)
+    ]
     return ThesisLine(
         what="Eq. 2.3: d = r - f cos(alpha), mm (Lower-14)",
         printed="no number",
@@ -578,8 +581,8 @@ def _depth_line(angles: tuple[float, ...]) -> ThesisLine:
 
 
 def _gap_line(angles: tuple[float, ...], narrow: Mouth, wide: Mouth) -> ThesisLine:
-    every = [_TURN_RAD * depth for length in _ARCH_LENGTHS_MM.values() for depth in _projected_mm(angles, length)]
-    lower = [_TURN_RAD * depth for depth in _projected_mm(angles, _ARCH_LENGTHS_MM["Lower-14"])]
+    every = [_TURN_RAD * depth for length in _ARCH_LENGTHS_MM.values() for depth in _projection_mm(angles, length)]
+    lower = [_TURN_RAD * depth for depth in _projection_mm(angles, _ARCH_LENGTHS_MM["Lower-14"])]
     behind = float(tooth_ends_mm(Anatomy().molar_depth_mm.mean)[-1])
     model = [float(np.asarray(mouth.gap_mm(behind))) for mouth in (narrow, wide)]
     return ThesisLine(
@@ -594,11 +597,6 @@ def _gap_line(angles: tuple[float, ...], narrow: Mouth, wide: Mouth) -> ThesisLi
     )
 
 
-def _projected_mm(angles: tuple[float, ...], length_mm: float) -> list[float]:
+def _projection_mm(angles: tuple[float, ...], length_mm: float) -> list[float]:
     """d of Eq. 2.3 as printed, for each r."""
     return [radius - length_mm * float(np.cos(angle)) for radius, angle in zip(_RADII_MM, angles, strict=True)]
-
-
-def _distance_mm(radius_mm: float, angle_rad: float, length_mm: float) -> float:
-    """Hinge axis to a tooth that lies behind the incisors by a length along the occlusal plane."""
-    return float(np.sqrt(radius_mm**2 + length_mm**2 - 2 * radius_mm * length_mm * np.cos(angle_rad)))

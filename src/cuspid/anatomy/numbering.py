@@ -1,4 +1,4 @@
-"""Tooth labels of a file in FDI numbers: which numbering they are in is told from where the labelled teeth stand.
+"""Tooth labels of a file in FDI numbers: which numbering they use is inferred from where the labelled teeth stand.
 
 A numbering says at which position each label stands: -1, -2 ... from the midline backwards on the patient's right, and
 1, 2 ... on the left. How far along the arch from the midline each position lies is known from the widths of teeth. A
@@ -16,7 +16,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from cuspid.model.jaw import ARCHES, FDI_FROM_UNIVERSAL, GUM, Arch
 from cuspid.model.mesh import Mesh
@@ -84,8 +84,8 @@ def number_teeth(
 ) -> Numbered:
     """FDI numbers for the labels of a mesh in its occlusal frame.
 
-    ``sure``: whether the frame is that of a whole arch; otherwise numbers alone tell. ``arch``: where something else
-    than the labels tells it. ``numbering`` and ``label_map`` (label to FDI) overrule what the teeth tell. ``source``
+    ``sure``: whether the frame is that of a whole arch; otherwise the numbers alone decide. ``arch``: where it is known
+    from elsewhere than the labels. ``numbering`` and ``label_map`` (label to FDI) overrule the inference. ``source``
     names the file. Raises InputError where the labels are in no numbering that is known, or contradict where the teeth
     stand, or the arch; the message names the numbering that fits.
     """
@@ -95,14 +95,14 @@ def number_teeth(
     if label_map is not None:
         return Numbered(labels=_map_labels(labels, _complete(source, label_map, values)))
     if numbering in ("fdi", "universal"):
-        return _plainly_read(source, labels, values, numbering, arch)
-    plain = _by_value(values) if numbering == "auto" else None
+        return _read_by_numbers(source, labels, values, numbering, arch)
+    plain = _guess_numbering(values) if numbering == "auto" else None
     teeth = _Teeth(labels, mesh) if sure else None
     if teeth is not None and len(teeth.labels) >= _WHOLE:
         return _read_in_place(source, labels, teeth, plain, arch, numbering)
     if numbering == "along-arch":
         raise InputError(f"{source}: labels along the arch are only understood on a whole arch; give --label-map")
-    return _plainly_read(source, labels, values, plain, arch)
+    return _read_by_numbers(source, labels, values, plain, arch)
 
 
 def _values(labels: Int[np.ndarray, "f"]) -> tuple[int, ...]:
@@ -122,14 +122,14 @@ def _complete(source: str, label_map: Mapping[int, int], values: tuple[int, ...]
     return label_map
 
 
-def _by_value(values: tuple[int, ...]) -> Literal["fdi", "universal"] | None:
+def _guess_numbering(values: tuple[int, ...]) -> Literal["fdi", "universal"] | None:
     found, fdi = set(values), set(FDI_FROM_UNIVERSAL.values())
     if found <= fdi and (found & set(range(33, 49)) or not found & {9, 10, 19, 20, 29, 30}):
         return "fdi"
     return "universal" if found <= set(FDI_FROM_UNIVERSAL) else None
 
 
-def _plainly_read(
+def _read_by_numbers(
     source: str, labels: Int[np.ndarray, "f"], values: tuple[int, ...], numbering: str | None, arch: Arch | None
 ) -> Numbered:
     """Labels as the numbers say; the teeth may not stand against the arch that is given."""
@@ -140,11 +140,11 @@ def _plainly_read(
             f"{source}: tooth labels {_abbreviate(values)} are {what} numbers; give --label-map, a JSON file of each "
             "label and its FDI number"
         )
-    told = _arch_of(table[value] for value in values)
-    if arch is not None and told is not None and told != arch:
+    labelled_arch = _arch_of(table[value] for value in values)
+    if arch is not None and labelled_arch is not None and labelled_arch != arch:
         raise InputError(
-            f"{source}: its labels {_abbreviate(values)}, read as {_NAMES[numbering]} numbers, are {told} teeth, but "
-            f"its name or --arch says {arch}; give the right --arch or --labels, or --label-map"
+            f"{source}: its labels {_abbreviate(values)}, read as {_NAMES[numbering]} numbers, are {labelled_arch} "
+            f"teeth, but its name or --arch says {arch}; give the right --arch or --labels, or --label-map"
         )
     return Numbered(labels=_map_labels(labels, table))
 
@@ -160,8 +160,8 @@ def _abbreviate(values: tuple[int, ...]) -> str:
             runs[-1][1] = value
         else:
             runs.append([value, value])
-    told = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
-    return ", ".join(told[:5]) + (" ..." if len(told) > 5 else "")
+    ranges = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
+    return ", ".join(ranges[:5]) + (" ..." if len(ranges) > 5 else "")
 
 
 def _arch_of(fdi: Iterator[int]) -> Arch | None:
@@ -188,18 +188,18 @@ class _Teeth:
         least = 0.1 * float(np.median(list(areas.values())))
         self.labels = tuple(each for each, area in areas.items() if area > least)
         """Of each tooth that is more than specks; of paired ones, negative on the side of -X."""
-        self.along_mm = _along_arch(np.array([mesh.centroid(owners == each)[:2] for each in self.labels]))
+        self.along_mm = _arch_lengths(np.array([mesh.centroid(owners == each)[:2] for each in self.labels]))
 
     def _are_paired(self, labels: Int[np.ndarray, "f"], mesh: Mesh) -> bool:
         if not 4 <= len(self.values) <= 8 or not set(self.values) <= set(range(1, 9)):
             return False
         right = mesh.face_centres[:, 0] < 0
-        areas = [(mesh.face_areas[faces & right].sum(), mesh.face_areas[faces].sum()) for faces in self._each(labels)]
+        areas = [
+            (mesh.face_areas[faces & right].sum(), mesh.face_areas[faces].sum())
+            for faces in (labels == value for value in self.values)
+        ]
         both = [_BOTH_SIDES * whole < part < (1 - _BOTH_SIDES) * whole for part, whole in areas]
         return float(np.mean(both)) > 0.7
-
-    def _each(self, labels: Int[np.ndarray, "f"]) -> Iterator[Bool[np.ndarray, "f"]]:
-        return (labels == value for value in self.values)
 
     def misfit_mm(self, positions: Positions, arch: Arch) -> float:
         """Mean distance along the arch of the teeth from where a numbering says that they stand; infinite if it does
@@ -212,7 +212,7 @@ class _Teeth:
         return float(np.abs(leftwards - scale * expected).mean())
 
 
-def _along_arch(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+def _arch_lengths(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
     """Length along the chain of teeth from where it crosses the midline x = 0, positive towards +X, mm."""
     around = np.arctan2(places[:, 0], places[:, 1] - places[:, 1].min() + 1.0)
     order = np.argsort(around)
@@ -252,7 +252,7 @@ def _read_in_place(
     ]
     found = sorted((each for each in found if np.isfinite(each.misfit_mm)), key=lambda each: each.misfit_mm)
     if not found and numbering == "auto" and plain is not None:  # teeth of both jaws
-        return _plainly_read(source, labels, teeth.values, plain, arch)
+        return _read_by_numbers(source, labels, teeth.values, plain, arch)
     others = [each for each in found if each.misfit_mm < _FITS_MM and each.name not in ("FDI", "Universal")]
     plainly = next((each for each in found if each.name == _NAMES.get(plain or "")), None)
     if plainly is not None and numbering == "auto" and plainly.misfit_mm < _DOUBTFUL_MM:
@@ -261,18 +261,18 @@ def _read_in_place(
         fitting = [each for each in others if each.arch == arch]
         against = arch not in (None, plainly.arch) and plainly.misfit_mm < _FITS_MM
         if against and not any(_is_better(each, plainly) for each in fitting):
-            raise InputError(f"{source}: {_against(teeth.values, plainly, arch, others)}")
-    best = _only([each for each in others if each.arch == arch])
+            raise InputError(f"{source}: {_arch_conflict(teeth.values, plainly, arch, others)}")
+    best = _unambiguous_reading([each for each in others if each.arch == arch])
     if best is None:
         raise InputError(f"{source}: {_complaint(teeth.values, plain, arch, others)}")
-    return _with_note(_map_labels(labels * teeth.sides, best.fdi()), best)
+    return _numbered_with_note(_map_labels(labels * teeth.sides, best.fdi()), best)
 
 
 def _is_better(one: _Reading, other: _Reading) -> bool:
     return one.misfit_mm < _BETTER * other.misfit_mm
 
 
-def _only(readings: list[_Reading]) -> _Reading | None:
+def _unambiguous_reading(readings: list[_Reading]) -> _Reading | None:
     """The reading of which no other one, with other numbers, fits about as well; None where there is none."""
     first = min(readings, key=lambda each: each.misfit_mm, default=None)
     if first is None or any(each.fdi() != first.fdi() and not _is_better(first, each) for each in readings):
@@ -280,14 +280,14 @@ def _only(readings: list[_Reading]) -> _Reading | None:
     return first
 
 
-def _with_note(labels: Int[np.ndarray, "f"], reading: _Reading) -> Numbered:
-    there = set(_values(labels))
-    fdi = [each for _, each in sorted(reading.fdi().items()) if each in there]
-    note = f"labels: read as {reading} (FDI {fdi[0]} to {fdi[-1]}), as the teeth stand; --label-map overrules that"
+def _numbered_with_note(labels: Int[np.ndarray, "f"], reading: _Reading) -> Numbered:
+    present = set(_values(labels))
+    fdi = [each for _, each in sorted(reading.fdi().items()) if each in present]
+    note = f"labels: read as {reading} (FDI {fdi[0]} to {fdi[-1]}), as the teeth stand; --label-map overrides this"
     return Numbered(labels=labels, notes=(note,))
 
 
-def _against(values: tuple[int, ...], plainly: _Reading, arch: Arch | None, others: list[_Reading]) -> str:
+def _arch_conflict(values: tuple[int, ...], plainly: _Reading, arch: Arch | None, others: list[_Reading]) -> str:
     """What is said of teeth that stand where their numbers say, in the other jaw."""
     along = ", or --labels along-arch" if any(each.arch == arch for each in others) else ""
     return (

@@ -1,6 +1,6 @@
 """The occlusal frame, scale and tooth numbers of a jaw that a user brings, from its shape alone.
 
-The outside of a scan tells where the crowns point: an open surface by the mean of its normals, a closed model by its
+The outside of a scan shows where the crowns point: an open surface by the mean of its normals, a closed model by its
 side that is not smooth. Seen from there the tips of the crowns give the occlusal plane, the symmetry of the crowns the
 midline, and their spread across it which end is anterior. Of a quadrant the anterior end is the one with the narrower
 crowns, and half of an arch, laid on them from there, tells where its front lies.
@@ -117,7 +117,7 @@ def find_occlusal_frame(mesh: Mesh) -> OcclusalFrame:
     mesh = mesh.thinned(_ENOUGH_FACES)
     start, notes = _upright(mesh)
     rests = not _is_part(mesh, start.rotation[2])
-    relief, level = _level_frame(mesh, _resting(_relief(mesh, start), start) if rests else start)
+    relief, level = _level_frame(mesh, _rest_on_crowns(_relief(mesh, start), start) if rests else start)
     crowns = relief.crowns()
     if len(crowns) == 0:
         note = "occlusal frame: unsure, as nothing looks like a crown; check the picture"
@@ -221,7 +221,7 @@ def _level_frame(
     return _relief(mesh, frame, off_plane_mm), frame
 
 
-def _resting(relief: _Relief, frame: Rigid3) -> Rigid3:
+def _rest_on_crowns(relief: _Relief, frame: Rigid3) -> Rigid3:
     """Turn a frame so that +Z is normal to the plane on which the jaw would rest, crowns down."""
     points = relief.points[np.isfinite(relief.points[..., 2])]
     if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6) < 3:
@@ -297,21 +297,21 @@ def _fit_arch(
     """Lay an arch on the crowns from a start ``angle``: misfit in mm (0 to 4), and where its front points."""
     arch = arch - arch.mean(axis=0)
     c, s = np.cos(angle), np.sin(angle)
-    laid = arch @ np.array([[c, s], [-s, c]]) + places.mean(axis=0)
+    fitted = arch @ np.array([[c, s], [-s, c]]) + places.mean(axis=0)
     tree = cKDTree(places)
     for _ in range(20):
-        beside, from_places = cKDTree(laid).query(places)
-        far, to_places = tree.query(laid)
+        beside, from_places = cKDTree(fitted).query(places)
+        far, to_places = tree.query(fitted)
         on, near = beside <= np.quantile(beside, _ON_ARCH), far < 6.0
         source = np.concatenate([arch[from_places[on]], arch[near]])
         target = np.concatenate([places[on], places[to_places[near]]])
         weights = np.concatenate([np.full(on.sum(), 1 / on.sum()), np.full(near.sum(), 1 / len(arch))])
-        laid = _apply_similarity(source, target, weights, arch)
-    there, _ = cKDTree(laid).query(places)
-    there = there[there <= np.quantile(there, _ON_ARCH)]
-    back, _ = tree.query(laid)
-    _, rotation, _ = best_similarity(arch, laid, np.ones(len(arch)))
-    misfit = np.minimum(there, 4.0).mean() + np.minimum(back, 4.0).mean()
+        fitted = _apply_similarity(source, target, weights, arch)
+    distances, _ = cKDTree(fitted).query(places)
+    distances = distances[distances <= np.quantile(distances, _ON_ARCH)]
+    back, _ = tree.query(fitted)
+    _, rotation, _ = best_similarity(arch, fitted, np.ones(len(arch)))
+    misfit = np.minimum(distances, 4.0).mean() + np.minimum(back, 4.0).mean()
     return float(misfit / 2), rotation[:, 1]
 
 

@@ -61,13 +61,13 @@ class SurfaceOptions(Options):
 def named_surfaces(jaw: Jaw, options: SurfaceOptions = SurfaceOptions()) -> dict[str, Bool[np.ndarray, "f"]]:
     """A mask over the faces for each of `SURFACES`; no face is in two of them, each face of a tooth is in one.
 
-    Raises InputError for a jaw with fewer than two labelled teeth, which do not tell how the arch runs.
+    Raises InputError for a jaw with fewer than two labelled teeth, too few to define the course of the arch.
     """
     codes = np.full(len(jaw.mesh.faces), -1)
     for fdi, axes in tooth_axes(jaw).items():
         faces = np.flatnonzero(jaw.tooth_faces(fdi))
         codes[faces] = _codes(fdi, _places(jaw, faces, axes), jaw.mesh.face_normals[faces] @ axes.T, options)
-    codes[_beside_teeth(jaw, options.gingival_mm)] = SURFACES.index("gingival")
+    codes[_gum_beside_teeth(jaw, options.gingival_mm)] = SURFACES.index("gingival")
     return {name: codes == code for code, name in enumerate(SURFACES)}
 
 
@@ -79,8 +79,8 @@ def tooth_axes(jaw: Jaw) -> dict[int, Float[np.ndarray, "3 3"]]:
     order = [fdi for fdi in _ARCH_ORDER if fdi in jaw.teeth]
     if len(order) < 2:
         raise InputError(
-            f"surfaces: the jaw has {len(order)} labelled teeth; at least two are needed to tell how the arch "
-            "runs (label each face with its FDI number, gum with 0)"
+            f"surfaces: the jaw has {len(order)} labelled teeth; at least two are needed to find the course of the "
+            f"arch (label each face with its FDI number, gum with 0)"
         )
     tangents = np.gradient([jaw.mesh.centroid(jaw.tooth_faces(fdi))[:2] for fdi in order], axis=0)
     return {fdi: _axes(fdi, along / np.linalg.norm(along)) for fdi, along in zip(order, tangents, strict=True)}
@@ -148,16 +148,16 @@ def _is_occlusal(places: _Places, normals: Local) -> Bool[np.ndarray, "n"]:
 
 
 def _rim(
-    turns: Float[np.ndarray, "m"], radius: Float[np.ndarray, "m"], wanted: Float[np.ndarray, "n"]
+    turns: Float[np.ndarray, "m"], radius: Float[np.ndarray, "m"], directions: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
     """Largest radius in each direction (in turns), smoothed around the circle, at the wanted directions."""
     largest = np.zeros(_WEDGES)
     np.maximum.at(largest, np.floor(turns * _WEDGES).astype(int) % _WEDGES, radius)
     smooth = uniform_filter1d(median_filter(largest, 3, mode="wrap"), 3, mode="wrap")
-    return np.interp(wanted, (np.arange(_WEDGES) + 0.5) / _WEDGES, smooth, period=1.0)
+    return np.interp(directions, (np.arange(_WEDGES) + 0.5) / _WEDGES, smooth, period=1.0)
 
 
-def _beside_teeth(jaw: Jaw, reach_mm: float) -> Int[np.ndarray, "n"]:
+def _gum_beside_teeth(jaw: Jaw, reach_mm: float) -> Int[np.ndarray, "n"]:
     """The faces of the gum that lie near a tooth."""
     tooth = np.any([jaw.tooth_faces(fdi) for fdi in jaw.teeth], axis=0)
     gum = np.flatnonzero(~tooth)

@@ -56,7 +56,7 @@ def tooth_regions(colors: Colors, mesh: Mesh) -> Int[np.ndarray, "f"] | None:
 
 
 def number_regions(regions: Int[np.ndarray, "f"], mesh: Mesh, arch: Arch) -> Int[np.ndarray, "f"] | None:
-    """FDI number for each face of a mesh in the occlusal frame whose teeth are told apart.
+    """FDI number for each face of a mesh in the occlusal frame whose teeth are separated.
 
     The teeth are numbered from the midline backwards on each side as if none were missing; None where a gap shows that
     one is, or where they are no row.

@@ -22,18 +22,18 @@ Poses = Mapping[str, Sequence[Rigid3]]
 """By instant, ``cam_from_board`` under each numbering of the corners."""
 
 
-def agreed_on(said: Sequence[Sequence[Rigid3]], distance_mm: float) -> tuple[Rigid3, int, float]:
+def consensus_motion(candidates: Sequence[Sequence[Rigid3]], distance_mm: float) -> tuple[Rigid3, int, float]:
     """Of the motions that each instant leaves open, the one that the most instants agree with, how many do, and by how
     many degrees an instant is off in the median."""
-    motions = [each for options in said for each in options]
-    instant = np.repeat(np.arange(len(said)), [len(options) for options in said])
+    motions = [each for options in candidates for each in options]
+    instant = np.repeat(np.arange(len(candidates)), [len(options) for options in candidates])
     turns, shifts = (
         cdist(values, values)
         for values in (np.stack([m.rotation.ravel() for m in motions]), np.stack([m.translation for m in motions]))
     )
     turns = 2 * np.rad2deg(np.arcsin(np.minimum(turns / np.sqrt(8), 1.0)))  # |A - B| = sqrt(8) sin(angle / 2)
-    agree, off = np.zeros(len(motions), dtype=np.int64), np.zeros((len(motions), len(said)))
-    for k in range(len(said)):
+    agree, off = np.zeros(len(motions), dtype=np.int64), np.zeros((len(motions), len(candidates)))
+    for k in range(len(candidates)):
         own = np.flatnonzero(instant == k)
         nearest = own[np.argmin(turns[:, own], axis=1)], np.arange(len(motions))
         off[:, k] = turns[nearest]
@@ -57,8 +57,8 @@ def started_later(new: Poses, known: Poses, distance_mm: float) -> tuple[int, in
         if late == 0 or count < fewest:
             continue
         both = [k for k in news if k + late in knowns]
-        said = [[pose @ knowns[k + late][0].inverse() for pose in news[k]] for k in both]
-        _, agreeing, off_deg = agreed_on(said, distance_mm)
+        candidates = [[pose @ knowns[k + late][0].inverse() for pose in news[k]] for k in both]
+        _, agreeing, off_deg = consensus_motion(candidates, distance_mm)
         if 2 * agreeing >= count:
             fits.append((off_deg, late, count, agreeing))
     return min(fits)[1:] if fits else None
@@ -82,7 +82,7 @@ def disagreement_between(
     )
 
 
-def apart(one: Rigid3, other: Rigid3) -> tuple[float, float]:
-    """The turn between two motions, degrees, and the distance, mm."""
+def motion_difference(one: Rigid3, other: Rigid3) -> tuple[float, float]:
+    """Rotation (degrees) and distance (mm) between two motions."""
     between = one @ other.inverse()
     return between.angle_deg, float(np.linalg.norm(one.translation - other.translation))

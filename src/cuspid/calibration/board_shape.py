@@ -1,9 +1,9 @@
 """Where the corners of a board lie that was not printed and mounted evenly.
 
 Each corner may be off from where it was given, in the plane of the board and out of it, with one standard deviation for
-either, which the images tell (empirical Bayes; D. MacKay, Neural Computation 4, 1992, equation 3.14). It is the same in
-all images, so an adjustment takes it for the lens unless it is asked about both. A board that is larger or smaller as a
-whole cannot be told from cameras that are nearer or farther, so the size stays as given.
+either, estimated from the images (empirical Bayes; D. MacKay, Neural Computation 4, 1992, equation 3.14). It is the
+same in all images, so an adjustment takes it for the lens unless it is asked about both. A change of the size of the
+whole board cannot be distinguished from a change of distance, so the size stays as given.
 
 Of a board of many corners, nodes of a coarser grid are moved, and the corners between them follow (bilinear).
 """
@@ -56,7 +56,7 @@ class BoardShape:
         return np.asarray(np.einsum("nm,nmj->nj", shares, self.offsets_mm[nodes]))
 
     def with_step(self, step_mm: Float[np.ndarray, "k"]) -> BoardShape:
-        """With nodes that lie elsewhere by so much."""
+        """The board with its nodes displaced by a step."""
         return replace(self, offsets_mm=self.offsets_mm + step_mm.reshape(-1, 3))
 
     def precision(self, board: Board) -> Float[np.ndarray, "k k"]:
@@ -72,20 +72,20 @@ class BoardShape:
         return np.asarray(known)
 
     def as_uneven(self, variance_mm2: Float[np.ndarray, "s 3"], board: Board) -> BoardShape:
-        """With the standard deviations that its offsets show, given how well these are known."""
+        """The board with standard deviations estimated from its offsets and their variances."""
         modes = np.stack([mode / np.linalg.norm(mode) for mode in _affine(board)])
         flat = self.offsets_mm.ravel()
         offsets = (flat - modes.T @ (modes @ flat)).reshape(-1, 3)
         sigma = []
         for axes, was in zip((slice(0, 2), slice(2, 3)), self.sigma_mm, strict=True):
-            told = variance_mm2[:, axes].size - variance_mm2[:, axes].sum() / was**2
-            seen = np.sum(offsets[:, axes] ** 2) / max(float(told), 1e-3)
+            dof = variance_mm2[:, axes].size - variance_mm2[:, axes].sum() / was**2
+            seen = np.sum(offsets[:, axes] ** 2) / max(float(dof), 1e-3)
             sigma.append(max(float(np.sqrt(seen)), _FLAT * board.square_mm))
         return replace(self, sigma_mm=(sigma[0], sigma[1]))
 
 
 def is_grid_of_corners(board: Target) -> TypeGuard[Board]:
-    """Whether how uneven it is can be told: one flat board with the corners of squares."""
+    """Whether its unevenness can be estimated: one flat board with the corners of squares."""
     return isinstance(board, Board) and board.kind in ("charuco", "chessboard") and board.terraces == 1
 
 

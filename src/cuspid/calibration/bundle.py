@@ -114,7 +114,7 @@ class Timing:
     def later(
         self, cameras: Float[np.ndarray, "c"], readouts: Float[np.ndarray, "r"], views: Float[np.ndarray, "v"]
     ) -> Timing:
-        """With delays and readouts that are longer by so many frames."""
+        """The timing with delays and readouts increased by so many frames."""
         return replace(
             self,
             by_camera=_longer(self.by_camera, cameras),
@@ -186,7 +186,7 @@ class Adjusted:
 
     @property
     def influence(self) -> Float[np.ndarray, "i k"]:
-        """By how much each instant moves these (:mod:`cuspid.calibration.scatter`)."""
+        """How much each instant moves the parameters (:mod:`cuspid.calibration.scatter`)."""
         return self._uncertainty[1]
 
     @cached_property
@@ -306,7 +306,7 @@ def bending_coordinates(board: Board, points: Float[np.ndarray, "n 3"]) -> Float
     return np.asarray((points[:, :2] - size / 2) / (np.linalg.norm(size) / 2))
 
 
-def of_instants(scene: BoardScene, instants: set[str]) -> BoardScene:
+def select_instants(scene: BoardScene, instants: set[str]) -> BoardScene:
     """The scene with the board at these instants only."""
     kept = {name: pose for name, pose in scene.rig_from_board.items() if name in instants}
     return replace(scene, rig_from_board=kept)
@@ -343,7 +343,7 @@ def _project(scene: BoardScene, seen: _Observations) -> _Projection:
     raw = seen.pixels - image
     if not (scene.loose_px > 0 and np.isfinite(raw).all()):
         return _Projection(in_cam, raw, None, None)
-    by_view = _by_view(scene, seen, in_cam)
+    by_view = _view_derivatives(scene, seen, in_cam)
     return _Projection(in_cam, raw, by_view, motion_equations(raw, by_view, np.ones(len(raw)), seen.starts))
 
 
@@ -351,10 +351,10 @@ def _bend_points(scene: BoardScene, seen: _Observations) -> Float[np.ndarray, "n
     """On the body."""
     flat = seen.points if scene.shape is None else seen.points + scene.shape.interpolate(seen.nodes, seen.shares)
     points = np.asarray(flat + (seen.basis @ scene.bending_mm)[:, None] * [0.0, 0.0, 1.0])
-    return _move_points(_all_mounts(scene, seen), seen.board, points) if scene.body_from_board else points
+    return _move_points(_board_mounts(scene, seen), seen.board, points) if scene.body_from_board else points
 
 
-def _all_mounts(scene: BoardScene, seen: _Observations) -> list[Rigid3]:
+def _board_mounts(scene: BoardScene, seen: _Observations) -> list[Rigid3]:
     """Of each board that is seen, by number."""
     return [scene.body_from_board.get(number, Rigid3.identity()) for number in range(int(seen.board.max()) + 1)]
 
@@ -379,22 +379,22 @@ def _derivatives(
     scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 2 w"]:
     """Derivatives of the projections by the unknowns in :func:`_columns`."""
-    by_point, by_parameters = _by_cameras(scene, seen, in_cam)
+    by_point, by_parameters = _camera_derivatives(scene, seen, in_cam)
     turn = np.stack([place.rotation for place in scene.cam_from_rig.values()])[seen.camera]
     by_rig = by_point @ turn
     weights, slopes = seen.weights(scene)
     places = _at_instants(scene, seen, _bend_points(scene, seen))
     turns = np.stack([pose.rotation for pose in scene.rig_from_board.values()])[seen.near[seen.view]]
     by_body = by_rig @ np.einsum("nk,nkjm->njm", weights, turns)
-    normals = np.stack([mount.rotation[:, 2] for mount in _all_mounts(scene, seen)])[seen.board]
+    normals = np.stack([mount.rotation[:, 2] for mount in _board_mounts(scene, seen)])[seen.board]
     by_bending = np.einsum("nij,nj->ni", by_body, normals)[:, :, None] * seen.basis[:, None]
-    blocks = [by_parameters, _by_motion(by_point, in_cam), by_bending]
+    blocks = [by_parameters, _motion_derivatives(by_point, in_cam), by_bending]
     if scene.shape is not None:
         blocks += [by_body * share[:, None, None] for share in seen.shares.T]
-    blocks += [weights[:, k, None, None] * _by_motion(by_rig, places[:, k]) for k in range(places.shape[1])]
+    blocks += [weights[:, k, None, None] * _motion_derivatives(by_rig, places[:, k]) for k in range(places.shape[1])]
     if scene.body_from_board:
         _, mounted = _mount_of(scene, seen)
-        blocks.append(mounted[:, None, None] * _by_motion(by_body, _bend_points(scene, seen)))
+        blocks.append(mounted[:, None, None] * _motion_derivatives(by_body, _bend_points(scene, seen)))
     if scene.timing is not None:
         by_time = np.einsum("nij,nk,nkj->ni", by_rig, slopes, places)[:, :, None]
         blocks += [by_time, by_time]
@@ -447,7 +447,7 @@ def _numbers(scene: BoardScene) -> int:
     return max(len(camera.parameters) for camera in scene.cameras.values())
 
 
-def _by_cameras(
+def _camera_derivatives(
     scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 k"]]:
     """Derivatives of the pixels by the points in the cameras, and by the parameters of these."""
@@ -459,7 +459,9 @@ def _by_cameras(
     return by_point, by_parameters
 
 
-def _by_motion(by_point: Float[np.ndarray, "n 2 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
+def _motion_derivatives(
+    by_point: Float[np.ndarray, "n 2 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 2 6"]:
     """Derivative by a small motion (rotation vector, translation) of the points."""
     turning = np.cross(points[:, None], by_point)
     return np.concatenate([turning, by_point], axis=2)
@@ -548,22 +550,22 @@ def adjust_board(
     seen = _Observations.of(views, board, start)
     free = _Free.of(start, seen, board, only_boards=only_boards)
     scene, settled = _minimize(start, seen, free)
-    told = not (only_boards or keep_scales) and (scene.shape is not None or scene.loose_px > 0)
-    for _ in range(_TELLINGS if told else 0):
-        before, scene = scene, _as_told(scene, seen, free, board)
-        if _is_told_alike(before, scene):
+    estimate_priors = not (only_boards or keep_scales) and (scene.shape is not None or scene.loose_px > 0)
+    for _ in range(_TELLINGS if estimate_priors else 0):
+        before, scene = scene, _update_priors(scene, seen, free, board)
+        if _priors_converged(before, scene):
             break
         free = _Free.of(scene, seen, board, only_boards=only_boards)
         scene, settled = _minimize(scene, seen, free)
-    there = _project(scene, seen)
-    pieces = np.split(there.raw, seen.starts[1:-1])
-    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
+    projection = _project(scene, seen)
+    pieces = np.split(projection.raw, seen.starts[1:-1])
+    sigma_px = _scale(_project_out_motions(scene, seen, projection, None)[0])
     return Adjusted(
         scene=scene,
         sigma_px=sigma_px,
         residuals=dict(zip(seen.keys, pieces, strict=True)),
         settled=settled,
-        equations=None if only_boards else _Equations.of(scene, seen, there, sigma_px, free),
+        equations=None if only_boards else _Equations.of(scene, seen, projection, sigma_px, free),
     )
 
 
@@ -573,21 +575,21 @@ def unevenness_score(found: Adjusted, views: Views, board: Board) -> float:
     scene = replace(found.scene, shape=BoardShape.even(board))
     seen = _Observations.of(views, board, scene)
     free = _Free.of(scene, seen, board, only_boards=False)
-    of_shape = _of_kind(scene, free, _SHAPES)
+    of_shape = _mask_of_kind(scene, free, _SHAPES)
     rows = _weigh_equations(scene, seen, _project(scene, seen), found.sigma_px, free)
-    told = np.diag(matrix_of(rows.values, free.layout))[of_shape]
+    information = np.diag(matrix_of(rows.values, free.layout))[of_shape]
     pull = rows.pull[of_shape]
-    return float(np.mean(pull[told > 0] ** 2 / told[told > 0]))
+    return float(np.mean(pull[information > 0] ** 2 / information[information > 0]))
 
 
-def in_front(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, str], BoardView]:
+def views_in_front(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, str], BoardView]:
     """The views of which every corner lies in front of the camera."""
     seen = _Observations.of(views, board, scene)
     residuals = np.split(_project(scene, seen).raw, seen.starts[1:-1])
     return {key: views[key] for key, each in zip(seen.keys, residuals, strict=True) if np.isfinite(each).all()}
 
 
-def at_middle_rows(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, str], BoardView]:
+def views_at_middle_rows(scene: BoardScene, views: Views, board: Target) -> dict[tuple[str, str], BoardView]:
     """Views with their corners where they would have been seen if all rows were exposed with the middle one."""
     if scene.timing is None or not scene.timing.readout:
         return dict(views)
@@ -599,11 +601,11 @@ def at_middle_rows(scene: BoardScene, views: Views, board: Target) -> dict[tuple
 
 def _minimize(scene: BoardScene, seen: _Observations, free: _Free) -> tuple[BoardScene, bool]:
     """The best scene, and whether another step would not have been worth it."""
-    there = _project(scene, seen)
-    if not there.is_whole:
+    projection = _project(scene, seen)
+    if not projection.is_whole:
         raise ReconstructionError("calibration: a corner of the board lies behind a camera that saw it")
     damping, settled, steps = 1e-4, False, 0
-    here = _Slope.of(scene, seen, there, free)
+    here = _Slope.of(scene, seen, projection, free)
     while not settled and steps < _STEPS and damping < _MOST_DAMPING:
         steps += 1
         step = _solve(here.matrix + damping * np.diag(np.diag(here.matrix)), here.gradient)
@@ -629,53 +631,55 @@ class _Slope:
     gradient: Float[np.ndarray, "k"]
 
     @staticmethod
-    def of(scene: BoardScene, seen: _Observations, there: _Projection, free: _Free) -> _Slope:
+    def of(scene: BoardScene, seen: _Observations, projection: _Projection, free: _Free) -> _Slope:
         """Given where it puts the corners."""
-        sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
-        apart = _project_out_motions(scene, seen, there, sigma_px)
+        sigma_px = _scale(_project_out_motions(scene, seen, projection, None)[0])
+        apart = _project_out_motions(scene, seen, projection, sigma_px)
         cost = _cost_of(scene, *apart, sigma_px, free)
         return _Slope(
-            sigma_px, cost, *_normal(scene, _weigh_equations(scene, seen, there, sigma_px, free, apart), free)
+            sigma_px, cost, *_normal(scene, _weigh_equations(scene, seen, projection, sigma_px, free, apart), free)
         )
 
 
 def _project_out_motions(
     scene: BoardScene,
     seen: _Observations,
-    there: _Projection,
+    projection: _Projection,
     sigma_px: float | None,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "v 6"]]:
     """The residuals without what the board was elsewhere by in each view, and that, px; by a standard deviation of a
     coordinate, or by what it is found to be."""
-    motions, residuals, by_view = np.zeros((len(seen.keys), _PLACE)), there.raw, there.by_view
-    if by_view is None or there.of_motions is None:
+    motions, residuals, by_view = np.zeros((len(seen.keys), _PLACE)), projection.raw, projection.by_view
+    if by_view is None or projection.of_motions is None:
         return residuals, motions
     for _ in range(_LOOSE_ROUNDS):
         sigma, before = _scale(residuals) if sigma_px is None else sigma_px, motions
         odd = 1 - sigma**2 * _weights(residuals, sigma)
-        less, pull = motion_equations(there.raw, by_view, odd, seen.starts)
-        matrix, right = (there.of_motions[0] - less) / sigma**2, (there.of_motions[1] - pull) / sigma**2
+        less, pull = motion_equations(projection.raw, by_view, odd, seen.starts)
+        matrix, right = (projection.of_motions[0] - less) / sigma**2, (projection.of_motions[1] - pull) / sigma**2
         matrix += np.eye(_PLACE) / scene.loose_px**2
         motions = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
         if np.array_equal(motions, before):
             break
-        residuals = without_motions(there.raw, by_view, seen.starts, motions)
+        residuals = without_motions(projection.raw, by_view, seen.starts, motions)
     return residuals, motions
 
 
-def _of_views(seen: _Observations, values: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "v *k"]:
+def _sum_by_view(seen: _Observations, values: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "v *k"]:
     """Sums over the corners of each view."""
     return np.asarray(np.add.reduceat(values, seen.starts[:-1], axis=0))
 
 
-def _by_view(scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
+def _view_derivatives(
+    scene: BoardScene, seen: _Observations, in_cam: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 2 6"]:
     """Derivatives by a motion of the board in each view, about its middle, whose numbers are what the corners move by,
     px."""
-    by_point, _ = _by_cameras(scene, seen, in_cam)
+    by_point, _ = _camera_derivatives(scene, seen, in_cam)
     counts = np.diff(seen.starts)
-    middle = _of_views(seen, in_cam) / counts[:, None]
+    middle = _sum_by_view(seen, in_cam) / counts[:, None]
     away = in_cam - middle[seen.view]
-    size = np.sqrt(_of_views(seen, np.sum(away**2, axis=1)) / counts)
+    size = np.sqrt(_sum_by_view(seen, np.sum(away**2, axis=1)) / counts)
     focal = np.array([camera.focal_px.mean() for camera in scene.cameras.values()])[seen.camera]
     px = (np.linalg.norm(middle, axis=1)[seen.view] / focal)[:, None, None]
     return np.asarray(
@@ -697,12 +701,12 @@ def _scale(residuals: Float[np.ndarray, "n 2"]) -> float:
 def _cost(
     scene: BoardScene,
     seen: _Observations,
-    there: _Projection,
+    projection: _Projection,
     sigma_px: float,
     free: _Free,
 ) -> float:
     """Huber loss of the residuals, and the prior; infinite where a corner lies behind a camera."""
-    return _cost_of(scene, *_project_out_motions(scene, seen, there, sigma_px), sigma_px, free)
+    return _cost_of(scene, *_project_out_motions(scene, seen, projection, sigma_px), sigma_px, free)
 
 
 def _cost_of(
@@ -716,9 +720,9 @@ def _cost_of(
     if not np.isfinite(lengths).all():
         return np.inf
     loss = np.where(lengths <= _KNEE, lengths**2, 2 * _KNEE * lengths - _KNEE**2)
-    held = _prior_offset(scene)[free.columns]
+    offset = _prior_offset(scene)[free.columns]
     moved = float(np.sum(motions**2)) / scene.loose_px**2 if scene.loose_px else 0.0
-    return float(loss.sum() + held @ free.prior @ held) + moved
+    return float(loss.sum() + offset @ free.prior @ offset) + moved
 
 
 def _lens_precision(camera: Camera, numbers: int) -> Float[np.ndarray, "n"]:
@@ -796,19 +800,19 @@ class _Rows:
 def _weigh_equations(
     scene: BoardScene,
     seen: _Observations,
-    there: _Projection,
+    projection: _Projection,
     sigma_px: float,
     free: _Free,
     apart: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "v 6"]] | None = None,
 ) -> _Rows:
     """``apart``, if it is known: what :func:`_project_out_motions` returns."""
-    residuals, motions = apart or _project_out_motions(scene, seen, there, sigma_px)
+    residuals, motions = apart or _project_out_motions(scene, seen, projection, sigma_px)
     weights = np.sqrt(_weights(residuals, sigma_px))[:, None]
-    values, weighed = _derivatives(scene, seen, there.in_cam) * weights[:, :, None], residuals * weights
-    if there.by_view is None:
+    values, weighed = _derivatives(scene, seen, projection.in_cam) * weights[:, :, None], residuals * weights
+    if projection.by_view is None:
         spread, between = np.zeros((len(seen.keys), _PLACE, _PLACE)), np.zeros((len(free.layout.unknowns), _PLACE))
         return _Rows(free.layout, values, weighed, None, motions, spread, between)
-    by_motion = there.by_view * weights[:, :, None]
+    by_motion = projection.by_view * weights[:, :, None]
     matrix, _ = motion_equations(weighed, by_motion, np.ones(len(weighed)), seen.starts)
     spread = np.asarray(np.linalg.inv(matrix + np.eye(_PLACE) / scene.loose_px**2))
     between = between_motions(values, by_motion, free.layout)
@@ -826,9 +830,9 @@ class _Equations:
     """Of the normal equations, with what the prior tells."""
 
     @staticmethod
-    def of(scene: BoardScene, seen: _Observations, there: _Projection, sigma_px: float, free: _Free) -> _Equations:
+    def of(scene: BoardScene, seen: _Observations, projection: _Projection, sigma_px: float, free: _Free) -> _Equations:
         """Raises ReconstructionError where the images leave something undetermined."""
-        rows = _weigh_equations(scene, seen, there, sigma_px, free)
+        rows = _weigh_equations(scene, seen, projection, sigma_px, free)
         matrix = rows.matrix + free.prior
         _solve(matrix, np.zeros(len(matrix)))
         return _Equations(seen, free, rows, matrix)
@@ -886,17 +890,17 @@ def _apply_step(scene: BoardScene, free: _Free, step: Float[np.ndarray, "k"]) ->
             name: camera.with_parameters(each)
             for (name, camera), each in zip(scene.cameras.items(), parameters, strict=True)
         },
-        cam_from_rig=_all_moved(scene.cam_from_rig, places),
-        rig_from_board=_all_moved(scene.rig_from_board, boards),
+        cam_from_rig=_apply_motions(scene.cam_from_rig, places),
+        rig_from_board=_apply_motions(scene.rig_from_board, boards),
         bending_mm=scene.bending_mm + bending,
-        body_from_board=_all_moved(scene.body_from_board, mounts),
+        body_from_board=_apply_motions(scene.body_from_board, mounts),
         shape=scene.shape and scene.shape.with_step(shape),
         timing=scene.timing and scene.timing.later(cameras, readouts, views),
         loose_px=scene.loose_px,
     )
 
 
-def _all_moved(poses: Mapping[_Key, Rigid3], motions: Float[np.ndarray, "k"]) -> dict[_Key, Rigid3]:
+def _apply_motions(poses: Mapping[_Key, Rigid3], motions: Float[np.ndarray, "k"]) -> dict[_Key, Rigid3]:
     turns = Rotation.from_rotvec(motions.reshape(-1, _PLACE)[:, :3]).as_matrix()
     shifts = motions.reshape(-1, _PLACE)[:, 3:]
     return {
@@ -907,14 +911,14 @@ def _all_moved(poses: Mapping[_Key, Rigid3], motions: Float[np.ndarray, "k"]) ->
 # --- how well it is known ----------------------------------------------------------------------------------------
 
 
-def _as_told(scene: BoardScene, seen: _Observations, free: _Free, board: Target) -> BoardScene:
+def _update_priors(scene: BoardScene, seen: _Observations, free: _Free, board: Target) -> BoardScene:
     """The scene with a board as uneven, and views as loose, as the images tell (D. MacKay, Neural Computation 4, 1992,
     equation 3.14)."""
-    there = _project(scene, seen)
-    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
-    rows = _weigh_equations(scene, seen, there, sigma_px, free)
+    projection = _project(scene, seen)
+    sigma_px = _scale(_project_out_motions(scene, seen, projection, None)[0])
+    rows = _weigh_equations(scene, seen, projection, sigma_px, free)
     inverse = _solve(rows.matrix + free.prior, np.eye(len(free.columns)))
-    of_shape = _of_kind(scene, free, _SHAPES)
+    of_shape = _mask_of_kind(scene, free, _SHAPES)
     if scene.shape is not None and of_shape.any():
         assert isinstance(board, Board)
         variances = np.diag(inverse)[of_shape].reshape(-1, 3)
@@ -924,13 +928,13 @@ def _as_told(scene: BoardScene, seen: _Observations, free: _Free, board: Target)
         for view in range(len(seen.keys)):
             unknowns, follow = rows.follow(view)
             unsure += np.sum((follow @ inverse[np.ix_(unknowns, unknowns)]) * follow)
-        told = rows.motions.size - unsure / scene.loose_px**2
-        loose_px = float(np.sqrt(np.sum(rows.motions**2) / max(told, 1e-3)))
+        dof = rows.motions.size - unsure / scene.loose_px**2
+        loose_px = float(np.sqrt(np.sum(rows.motions**2) / max(dof, 1e-3)))
         scene = replace(scene, loose_px=float(np.clip(loose_px, _TIGHT * sigma_px, _LOOSEST * sigma_px)))
     return scene
 
 
-def _is_told_alike(one: BoardScene, other: BoardScene) -> bool:
+def _priors_converged(one: BoardScene, other: BoardScene) -> bool:
     """Whether a board is as uneven, and views as loose, as before."""
     before, after = ([each.loose_px, *(each.shape.sigma_mm if each.shape else ())] for each in (one, other))
     return bool(np.allclose(before, after, rtol=_ALIKE, atol=0))
@@ -952,7 +956,7 @@ def _camera_covariance(
     whole[np.ix_(among, among)] = _solve(matrix, np.eye(len(matrix))[:, shown])[shown]
     project = np.eye(size)
     places = slice(sizes[_LENSES], sizes[_LENSES] + sizes[_CAMERAS])
-    project[places, places] = _without_common_motion(scene)
+    project[places, places] = _common_motion_projector(scene)
     common, moved = influences(matrix, _independent(known.rows, known.seen, scene.loose_px), free.of_instants)
     by_instant = np.zeros((len(moved), size))
     of_cameras = place[free.columns[common]] >= 0
@@ -962,10 +966,10 @@ def _camera_covariance(
 
 def common_free(scene: BoardScene, motions: Sequence[Float[np.ndarray, "6"]]) -> Float[np.ndarray, "c 6"]:
     """Small motions of the cameras without the part that is common to the rig as a whole."""
-    return np.asarray((_without_common_motion(scene) @ np.concatenate(motions)).reshape(-1, _PLACE))
+    return np.asarray((_common_motion_projector(scene) @ np.concatenate(motions)).reshape(-1, _PLACE))
 
 
-def _without_common_motion(scene: BoardScene) -> Float[np.ndarray, "m m"]:
+def _common_motion_projector(scene: BoardScene) -> Float[np.ndarray, "m m"]:
     """Takes from motions of the cameras that of the rig as a whole which is nearest to them."""
     places = list(scene.cam_from_rig.values())
     common = np.concatenate([_adjoint(place) for place in places])
@@ -984,16 +988,16 @@ def readout_score(scene: BoardScene, views: Views, board: Target) -> float:
     """How far a first step from the readouts of a scene would change one of them, in its standard deviations by how
     much the instants disagree."""
     seen = _Observations.of(views, board, scene)
-    free, there, count = _Free.of(scene, seen, board, only_boards=False), _project(scene, seen), len(scene.cameras)
-    sigma_px = _scale(_project_out_motions(scene, seen, there, None)[0])
-    known = _Equations.of(scene, seen, there, sigma_px, free)
+    free, projection, count = _Free.of(scene, seen, board, only_boards=False), _project(scene, seen), len(scene.cameras)
+    sigma_px = _scale(_project_out_motions(scene, seen, projection, None)[0])
+    known = _Equations.of(scene, seen, projection, sigma_px, free)
     by_corners, moved = _camera_covariance(scene, known)
     sigmas = np.sqrt(np.diag(covariance_of(by_corners[-count:, -count:], moved[:, -count:])))
     _, gradient = _normal(scene, known.rows, free)
-    return float(np.max(np.abs(_solve(known.matrix, gradient)[_of_kind(scene, free, _READOUTS)]) / sigmas))
+    return float(np.max(np.abs(_solve(known.matrix, gradient)[_mask_of_kind(scene, free, _READOUTS)]) / sigmas))
 
 
-def _of_kind(scene: BoardScene, free: _Free, kind: int) -> Bool[np.ndarray, "k"]:
+def _mask_of_kind(scene: BoardScene, free: _Free, kind: int) -> Bool[np.ndarray, "k"]:
     """Which of the free unknowns are of a kind."""
     sizes = _sizes(scene)
     return np.asarray(np.repeat(np.arange(len(sizes)), sizes)[free.columns] == kind)

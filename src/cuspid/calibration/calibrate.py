@@ -1,5 +1,5 @@
-"""From views of a board to a rig with its uncertainty: initialise, adjust, leave out what does not fit, and test the
-result on views that were not used for it."""
+"""Calibrates a rig, with its uncertainty, from views of a board: initialise, adjust, reject outliers, and test the
+result on views that were held out."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from cuspid.calibration.bundle import (
     BoardScene,
     Timing,
     adjust_board,
-    at_middle_rows,
     common_free,
-    in_front,
     mounted_cameras,
-    of_instants,
     readout_score,
     readout_sigmas,
+    select_instants,
     unevenness_score,
+    views_at_middle_rows,
+    views_in_front,
 )
 from cuspid.calibration.circle_centres import centre_shifts
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, split_by_board
-from cuspid.calibration.joining import joined_boards
-from cuspid.calibration.lenses import LensChoice, LensName, choose_lens, splined_where_earned
+from cuspid.calibration.joining import join_boards
+from cuspid.calibration.lenses import LensChoice, LensName, choose_lens, select_splined_lens
 from cuspid.calibration.start import LEAST_VIEWS, board_pose, groups, join_cameras, renumber_instant, require_one_group
-from cuspid.calibration.timing import adjust_scene, allow_delays, follow_each_other, rolling
+from cuspid.calibration.timing import adjust_scene, allow_delays, allow_rolling, are_consecutive
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board, BoardSet, Target
 from cuspid.model.camera import Camera
@@ -81,7 +81,8 @@ class CalibrationOptions(Options):
     exposed, and kept if that explains images that it was not estimated from. global: all rows are exposed at once."""
 
     frames_per_s: Annotated[float | None, Range(0.001, 100_000)] = None
-    """Rate at which the board was filmed, to tell delays and readouts in ms too; default: that which videos state."""
+    """Rate at which the board was filmed, to report delays and readouts in ms, too; default: that which videos
+    state."""
     outlier_sigmas: Annotated[float, Range(2, 1000)] = 4.0
     """A view is left out if the RMS of its residuals is beyond this, in standard deviations of all residuals or of its
     camera's."""
@@ -110,7 +111,7 @@ class CameraCheck:
     """The same for the pose in the rig."""
     alone_apart: float | None
     """Difference between the parameters and those from its own views alone, in the standard deviations that the latter
-    state; below 1 if these are right; None if there were too few views to tell."""
+    state; below 1 if these are right; None if there were too few views."""
     delay_frames: float | None
     """How many frames after the mean of all cameras it saw the board; None if all exposed together."""
     delay_spread_frames: float | None
@@ -136,8 +137,8 @@ class RigCalibration:
     """Bending of the board, or of several one after the other, or the error of its steps; see
     :mod:`cuspid.calibration.bundle`."""
     body_from_board: Mapping[int, Rigid3]
-    """Of several boards, where they are on the body that they are fixed to, by number from 0; others carry its
-    frame."""
+    """Where each of several boards is on the body that carries them, by number from 0; a board that is not listed
+    defines the frame of the body."""
     uneven_mm: tuple[float, float] | None
     """Standard deviations by which its corners lie elsewhere than given, in its plane and out of it; None if that
     explains no more."""
@@ -145,7 +146,7 @@ class RigCalibration:
     """Standard deviation by which a view shows the board elsewhere than the others at that instant do; None for one
     camera."""
     widened: Mapping[str, float]
-    """By what factor the standard deviations of each lens were widened for what they do not explain; 1 if not."""
+    """Factor by which the standard deviations of each lens were widened to cover unexplained differences; 1 if none."""
     cameras: Mapping[str, CameraCheck]
     """Checks by camera."""
     pixels: Mapping[str, Float[np.ndarray, "n 2"]]
@@ -207,19 +208,19 @@ def _calibrate_once(
             f"calibration: the board must be found at {LEAST_VIEWS} instants or more by each camera, but is at fewer "
             f"({', '.join(few)}); show it at more, or check that its columns, rows, dictionary and kind are right"
         )
-    lenses = {name: _alone(name, views, board, size, options.lens) for name, size in sizes.items()}
+    lenses = {name: _choose_camera_lens(name, views, board, size, options.lens) for name, size in sizes.items()}
     choices = {name: choice for name, (choice, _) in lenses.items()}
     alone = {name: each for name, (_, each) in lenses.items()}
     cameras = {name: each.scene.cameras[""] for name, each in alone.items()}
-    how: tuple[str, ...] = ()
+    notes_joining: tuple[str, ...] = ()
     if isinstance(board, BoardSet):
-        start, common, how = joined_boards(views, board, cameras)
+        start, common, notes_joining = join_boards(views, board, cameras)
     else:
         start, common = join_cameras(views, board, cameras, sorted({instant for _, instant in views}))
 
     def attempt(scene: BoardScene, lenses: Mapping[str, LensChoice] = choices) -> _Trial:
         found, chosen, notes = _fit_cameras(scene, common, board, options)
-        return _Trial(found, _describe(found, chosen, board, lenses, (*how, *notes), options.frames_per_s))
+        return _Trial(found, _describe(found, chosen, board, lenses, (*notes_joining, *notes), options.frames_per_s))
 
     best = _with_timing(attempt(start), start, common, board, options, attempt)
     splined = _find_splines(best, choices, board) if options.lens == "auto" else {}
@@ -230,7 +231,7 @@ def _calibrate_once(
         scene = replace(scene, cameras=cameras, rig_from_board=poses, loose_px=0.0, shape=None)
         with suppress(ReconstructionError):  # together with the other cameras
             better = attempt(scene, {**choices, **{name: choice for name, (choice, _) in splined.items()}})
-            best = better if _keeps_most(better.described, best.described) else best
+            best = better if _retains_most_views(better.described, best.described) else best
     return best.described
 
 
@@ -238,10 +239,10 @@ def _find_splines(
     best: _Trial, choices: Mapping[str, LensChoice], board: Target
 ) -> dict[str, tuple[LensChoice, Camera]]:
     """Cameras whose views call for a splined lens, once it is known when each row was exposed."""
-    views, found = at_middle_rows(best.found.scene, best.described.views, board), {}
+    views, found = views_at_middle_rows(best.found.scene, best.described.views, board), {}
     for name, camera in best.found.scene.cameras.items():
         own = [part for (one, _), view in views.items() if one == name for part in split_by_board(view, board)]
-        splined = splined_where_earned(choices[name], camera, own, board)
+        splined = select_splined_lens(choices[name], camera, own, board)
         if splined is not None:
             found[name] = splined
     return found
@@ -257,11 +258,11 @@ def _with_timing(
 ) -> _Trial:
     """With delays of the cameras and readouts, where these explain more."""
     frame = frame_numbers(start.rig_from_board)
-    if frame is None or not follow_each_other(frame):
+    if frame is None or not are_consecutive(frame):
         return best
 
     def may_roll(scene: BoardScene, used: Views) -> bool:
-        return options.shutter == "auto" and readout_score(rolling(scene, frame, used), used, board) > _ROLLING
+        return options.shutter == "auto" and readout_score(allow_rolling(scene, frame, used), used, board) > _ROLLING
 
     doubtful = any(_is_doubtful_together(check) for check in best.described.cameras.values())
     if len(start.cameras) > 1 and (doubtful or may_roll(best.found.scene, best.described.views)):
@@ -272,8 +273,8 @@ def _with_timing(
         return best
     scene = replace(best.found.scene, rig_from_board={**start.rig_from_board, **best.found.scene.rig_from_board})
     with suppress(ReconstructionError):  # nor readouts
-        rolled = attempt(rolling(replace(scene, loose_px=0.0, shape=None), frame, common))
-        best = rolled if _rolls(rolled, board) and _keeps_most(rolled.described, best.described) else best
+        rolled = attempt(allow_rolling(replace(scene, loose_px=0.0, shape=None), frame, common))
+        best = rolled if _rolls(rolled, board) and _retains_most_views(rolled.described, best.described) else best
     return best
 
 
@@ -299,10 +300,10 @@ def _rolls(rolled: _Trial, board: Target) -> bool:
 def _is_better(apart: RigCalibration, together: RigCalibration) -> bool:
     """Whether delays explain images that they were not estimated from, and not by leaving out views."""
     before, after = _held_out_px(together), _held_out_px(apart)
-    return bool(np.isfinite(before) and after < _LESS * before and _keeps_most(apart, together))
+    return bool(np.isfinite(before) and after < _LESS * before and _retains_most_views(apart, together))
 
 
-def _keeps_most(one: RigCalibration, other: RigCalibration) -> bool:
+def _retains_most_views(one: RigCalibration, other: RigCalibration) -> bool:
     """Whether a calibration is made from about as many views as another."""
     return len(one.views) > _LESS * len(other.views)
 
@@ -323,7 +324,7 @@ def _held_out_px(found: RigCalibration) -> float:
     return _rms(np.array([np.inf if check.held_out_px is None else check.held_out_px for check in checks]))
 
 
-def _alone(
+def _choose_camera_lens(
     name: str, views: Views, board: Target, size: tuple[int, int], lens: LensName
 ) -> tuple[LensChoice, Adjusted]:
     try:
@@ -344,14 +345,14 @@ def _fit_cameras(
     The cameras need not see the board at quite the same place. It is taken to be uneven where that explains instants
     better, by more than chance, that it was not estimated from.
     """
-    found, notes = _without_outliers(start, views, board, options)
+    found, notes = _adjust_robustly(start, views, board, options)
     if len(start.cameras) > 1:
         loose = replace(found.scene, loose_px=found.sigma_px)
         found = adjust_scene(loose, {key: views[key] for key in found.residuals}, board)
     used = {key: views[key] for key in found.residuals}
     if not is_grid_of_corners(board) or unevenness_score(found, used, board) < _EVEN:
         return found, views, notes
-    uneven, turned = _uneven(found, views, board)
+    uneven, turned = _estimate_unevenness(found, views, board)
     if uneven.scene.shape is None or uneven.scene.shape.is_even(board):
         return found, views, notes
     used = {key: turned[key] for key in found.residuals}
@@ -361,7 +362,7 @@ def _fit_cameras(
     return found, views, notes
 
 
-def _uneven(found: Adjusted, views: Views, board: Board) -> tuple[Adjusted, Views]:
+def _estimate_unevenness(found: Adjusted, views: Views, board: Board) -> tuple[Adjusted, Views]:
     """The cameras before a board that may be uneven, and the views with the numbering of their corners that it
     shows."""
     found = adjust_scene(
@@ -400,9 +401,9 @@ def _explains_more(one: Adjusted, other: Adjusted, views: Views, board: Board) -
 
 def _squares_without(scene: BoardScene, rest: Views, out: Views, board: Board) -> dict[str, float]:
     """Mean squares of the residuals at some instants by a calibration from others."""
-    found = adjust_scene(of_instants(scene, {key[1] for key in rest}), rest, board, keep_scales=True)
+    found = adjust_scene(select_instants(scene, {key[1] for key in rest}), rest, board, keep_scales=True)
     held = replace(found.scene, rig_from_board=scene.rig_from_board, timing=scene.timing)
-    held = of_instants(held, {key[1] for key in out})
+    held = select_instants(held, {key[1] for key in out})
     residuals = adjust_scene(held, out, board, only_boards=True).residuals
     instants = {key[1] for key in out}
     return {
@@ -411,21 +412,21 @@ def _squares_without(scene: BoardScene, rest: Views, out: Views, board: Board) -
     }
 
 
-def _without_outliers(
+def _adjust_robustly(
     scene: BoardScene, views: Views, board: Target, options: CalibrationOptions
 ) -> tuple[Adjusted, tuple[str, ...]]:
     """Adjust, leave out the views that do not fit, and again."""
-    sound = in_front(scene, views, board)
+    sound = views_in_front(scene, views, board)
     notes = [
         f"camera {camera}, {instant}: left out, no pose of the board explains it"
         for camera, instant in views
         if (camera, instant) not in sound
     ]
-    views, scene = sound, of_instants(scene, {instant for _, instant in sound})
+    views, scene = sound, select_instants(scene, {instant for _, instant in sound})
     _require_views(views, scene)
     for _ in range(options.rounds):
         found = adjust_scene(scene, views, board)
-        bad = _odd_ones(found, options)
+        bad = _outlying_views(found, options)
         if not bad:
             return found, tuple(notes)
         notes += [
@@ -435,11 +436,11 @@ def _without_outliers(
         ]
         views = {key: view for key, view in views.items() if key not in bad}
         _require_views(views, scene)
-        scene = of_instants(found.scene, {instant for _, instant in views})
+        scene = select_instants(found.scene, {instant for _, instant in views})
     return adjust_scene(scene, views, board), tuple(notes)
 
 
-def _odd_ones(found: Adjusted, options: CalibrationOptions) -> dict[tuple[str, str], tuple[float, float]]:
+def _outlying_views(found: Adjusted, options: CalibrationOptions) -> dict[tuple[str, str], tuple[float, float]]:
     """Views that do not fit: their RMS, and what is usual over all or for their camera, px."""
     rms = {key: _rms(residuals) for key, residuals in found.residuals.items()}
     usual = {
@@ -493,10 +494,10 @@ def size_notes(found: Rig, drawn: Rig, board: Target) -> tuple[str, ...]:
     growth = sizes[0] / max(sizes[1], 1e-9) - 1
     if abs(growth) < _ODD_SIZE:
         return ()
-    how = "farther apart" if growth > 0 else "closer together"
+    direction = "farther apart" if growth > 0 else "closer together"
     return (
-        f"the cameras lie {abs(growth):.1%} {how} than drawn: was --square-mm {board.square_mm:g} measured on the "
-        f"print? With {board.square_mm / (1 + growth):.3g} they lie as drawn",
+        f"the cameras lie {abs(growth):.1%} {direction} than drawn: was --square-mm {board.square_mm:g} measured on "
+        f"the print? With {board.square_mm / (1 + growth):.3g} they lie as drawn",
     )
 
 
@@ -516,7 +517,7 @@ def _describe(
     pixels = {name: np.concatenate([views[key].pixels for key in of[name]]) for name in names}
     residuals = {name: np.concatenate([found.residuals[key] for key in of[name]]) for name in names}
     held_out, apart = _cross_validated(found, views, board)
-    alone = {name: _by_itself(name, found, views, board) for name in names}
+    alone = {name: _calibrate_from_own_views(name, found, views, board) for name in names}
     seen = {key: found.scene.rig_from_view(*key) for key in views}
     distances = [np.linalg.norm((found.scene.cam_from_rig[key[0]] @ pose).translation) for key, pose in seen.items()]
     delays, readouts = _delays(found.scene, views), readout_sigmas(found)
@@ -529,7 +530,9 @@ def _describe(
             held_out_px=held_out.get(name),
             parameters_apart=apart[name][0] if name in apart else None,
             place_apart=apart[name][1] if name in apart else None,
-            alone_apart=_lens_apart(found.scene.cameras[name], alone[name]) if len(of[name]) >= _TELLING else None,
+            alone_apart=_lens_difference_in_sigmas(found.scene.cameras[name], alone[name])
+            if len(of[name]) >= _TELLING
+            else None,
             delay_frames=delays[name][0],
             delay_spread_frames=delays[name][1],
             readout=found.scene.timing.readout[name] if found.scene.timing and readouts else None,
@@ -554,7 +557,12 @@ def _describe(
         rig_from_view=seen,
         distance_mm=float(np.median(distances)),
         frames_per_s=frames_per_s,
-        notes=(*notes, *_of_board(found.scene), *_of_time(checks, frames_per_s), *_doubts(found.settled, checks, rig)),
+        notes=(
+            *notes,
+            *_board_notes(found.scene),
+            *_timing_notes(checks, frames_per_s),
+            *_doubt_notes(found.settled, checks, rig),
+        ),
     )
 
 
@@ -579,11 +587,11 @@ def _delays(scene: BoardScene, views: Views) -> dict[str, tuple[float, float] | 
     }
 
 
-def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjusted:
+def _calibrate_from_own_views(name: str, found: Adjusted, views: Views, board: Target) -> Adjusted:
     """A camera from its own views alone, beginning from the one that was found; of several boards each for itself."""
     if len(found.scene.cameras) == 1:
         return found
-    views = at_middle_rows(found.scene, {key: view for key, view in views.items() if key[0] == name}, board)
+    views = views_at_middle_rows(found.scene, {key: view for key, view in views.items() if key[0] == name}, board)
     own, poses = dict[tuple[str, str], BoardView](), dict[str, Rigid3]()
     for camera, instant in views:
         pose = found.scene.cam_from_rig[name] @ found.scene.rig_from_view(camera, instant)
@@ -606,10 +614,10 @@ def _by_itself(name: str, found: Adjusted, views: Views, board: Target) -> Adjus
     return adjust_board(scene, own, board, keep_scales=True)
 
 
-def _lens_apart(camera: Camera, alone: Adjusted) -> float:
+def _lens_difference_in_sigmas(camera: Camera, alone: Adjusted) -> float:
     """Difference of the parameters from those of the camera alone, in the standard deviations of these."""
     (other,) = (each.camera for each in mounted_cameras(alone).values())
-    return _in_sigmas(camera.parameters - other.parameters, require_covariance(other.covariance))
+    return _rms_in_sigmas(camera.parameters - other.parameters, require_covariance(other.covariance))
 
 
 def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCamera:
@@ -621,7 +629,7 @@ def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCame
     return replace(
         mounted,
         camera=camera,
-        covariance=_beyond_chance(check.place_apart) ** 2 * require_covariance(mounted.covariance),
+        covariance=_inflation_factor(check.place_apart) ** 2 * require_covariance(mounted.covariance),
         shutter=Shutter(
             delay_frames=check.delay_frames or 0.0,
             delay_sigma_frames=check.delay_spread_frames or 0.0,
@@ -632,15 +640,15 @@ def _widen_covariance(mounted: MountedCamera, check: CameraCheck) -> MountedCame
 
 
 def _lens_factor(check: CameraCheck) -> float:
-    return max(_beyond_chance(check.parameters_apart), _beyond_chance(check.alone_apart))
+    return max(_inflation_factor(check.parameters_apart), _inflation_factor(check.alone_apart))
 
 
-def _beyond_chance(apart: float | None) -> float:
+def _inflation_factor(apart: float | None) -> float:
     """How many standard deviations something is apart, where chance hardly explains that; else 1."""
     return apart if apart is not None and apart > _DOUBTFUL else 1.0
 
 
-def _of_board(scene: BoardScene) -> Iterator[str]:
+def _board_notes(scene: BoardScene) -> Iterator[str]:
     """Where its corners do not lie as given."""
     if scene.shape is not None:
         across, out = (1000 * sigma for sigma in scene.shape.sigma_mm)
@@ -650,7 +658,7 @@ def _of_board(scene: BoardScene) -> Iterator[str]:
         )
 
 
-def _of_time(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> Iterator[str]:
+def _timing_notes(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> Iterator[str]:
     """Where the cameras do not expose together, or not all of their rows."""
 
     def describe(name: str, frames: float, sigma: float | None, digits: int) -> str:
@@ -665,7 +673,7 @@ def _of_time(checks: Mapping[str, CameraCheck], frames_per_s: float | None) -> I
     if delays:
         yield (
             "the cameras did not expose together; by the motion of the board, in frames from their mean: "
-            f"{', '.join(delays)}; this is taken into account, but a board that is held still gives more"
+            f"{', '.join(delays)}; this is taken into account, but a board at rest gives more accurate results"
         )
         yield from _misnumbered({name: each.delay_frames or 0.0 for name, each in checks.items()})
     readouts = [
@@ -691,7 +699,7 @@ def _misnumbered(delays_frames: Mapping[str, float]) -> Iterator[str]:
             )
 
 
-def _doubts(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
+def _doubt_notes(settled: bool, checks: Mapping[str, CameraCheck], rig: Rig) -> Iterator[str]:
     """Where the search did not end; where the lens or the board is not what the model says, or the cameras were not
     triggered together; where the views leave the focal length open."""
     if not settled:
@@ -736,7 +744,7 @@ def _cross_validated(
         return {}, {}
     try:
         parts = [
-            adjust_scene(of_instants(found.scene, {key[1] for key in half}), half, board, keep_scales=True)
+            adjust_scene(select_instants(found.scene, {key[1] for key in half}), half, board, keep_scales=True)
             for half in halves
         ]
     except ReconstructionError:  # half of the views leave open where a board, or a camera, is
@@ -744,14 +752,16 @@ def _cross_validated(
     squares: dict[str, list[Float[np.ndarray, "n 2"]]] = {name: [] for name in found.scene.cameras}
     for part, other, other_views in zip(parts, parts[::-1], halves[::-1], strict=True):
         start = replace(part.scene, rig_from_board=other.scene.rig_from_board)
-        shown = in_front(start, other_views, board) if start.timing is None else other_views
+        shown = views_in_front(start, other_views, board) if start.timing is None else other_views
         if not shown:
             continue
-        start = of_instants(start, {instant for _, instant in shown})
+        start = select_instants(start, {instant for _, instant in shown})
         for (camera, _), residuals in adjust_scene(start, shown, board, only_boards=True).residuals.items():
             squares[camera].append(residuals)
     tell = all(count[name] >= _TELLING for count in counts for name in cameras)
-    return {name: _rms(np.concatenate(each)) for name, each in squares.items() if each}, _apart(*parts) if tell else {}
+    return {name: _rms(np.concatenate(each)) for name, each in squares.items() if each}, _differences_in_sigmas(
+        *parts
+    ) if tell else {}
 
 
 def _halves(views: Views, timing: Timing | None) -> list[Views]:
@@ -763,7 +773,7 @@ def _halves(views: Views, timing: Timing | None) -> list[Views]:
     return [{key: view for key, view in views.items() if half[key[1]] == k} for k in range(2)]
 
 
-def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
+def _differences_in_sigmas(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
     """Differences of parameters and of places, in standard deviations of the difference, RMS over the numbers."""
     between = [one.scene.cam_from_rig[name] @ pose.inverse() for name, pose in other.scene.cam_from_rig.items()]
     motions = common_free(one.scene, [np.array([*m.rotation_vector, *m.translation]) for m in between])
@@ -773,8 +783,8 @@ def _apart(one: Adjusted, other: Adjusted) -> dict[str, tuple[float, float]]:
         a, b = ours[name], theirs[name]
         shift = a.camera.parameters - b.camera.parameters
         found[name] = (
-            _in_sigmas(shift, require_covariance(a.camera.covariance) + require_covariance(b.camera.covariance)),
-            _in_sigmas(motion, require_covariance(a.covariance) + require_covariance(b.covariance)),
+            _rms_in_sigmas(shift, require_covariance(a.camera.covariance) + require_covariance(b.camera.covariance)),
+            _rms_in_sigmas(motion, require_covariance(a.covariance) + require_covariance(b.covariance)),
         )
     return found
 
@@ -786,6 +796,6 @@ def require_covariance(covariance: Float[np.ndarray, "n n"] | None) -> Float[np.
     return covariance
 
 
-def _in_sigmas(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray, "n n"]) -> float:
+def _rms_in_sigmas(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray, "n n"]) -> float:
     """RMS of a difference, each direction in its standard deviations."""
     return float(np.sqrt(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference / len(difference)))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
-from cuspid.calibration.circle_centres import seen_grid
+from cuspid.calibration.circle_centres import recognize_grid
 from cuspid.calibration.corners import find_corners
 from cuspid.calibration.lattice import find_lattice
 from cuspid.calibration.marker_layout import Outlines, board_by_markers
@@ -30,8 +30,8 @@ def cause_of_absence(images: Sequence[Gray], board: Target) -> str | None:
     """What makes the board be found in most of some images in which it is not as it stands, and what to change; None
     where nothing does."""
     if isinstance(board, BoardSet):
-        told = [(number, _verify_board(images, each)) for number, each in enumerate(board.boards, 1)]
-        alone = next((f"board {number}: {cause}" for number, cause in told if cause is not None), None)
+        causes = [(number, _verify_board(images, each)) for number, each in enumerate(board.boards, 1)]
+        alone = next((f"board {number}: {cause}" for number, cause in causes if cause is not None), None)
         return _other_ids(images, board) or alone
     return _verify_board(images, board) or _other_ids(images, board) or _other_markers(images, board)
 
@@ -67,7 +67,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
         old, yes = ("new", "--no-legacy") if board.legacy else ("old", "--legacy")
         yield f"the board has the {old} layout of OpenCV: give {yes}", replace(board, legacy=not board.legacy), False
     if board.kind != "circles":
-        yield "the images are mirrored: turn them over (or the print is: print it anew)", board, True
+        yield "the images are mirrored: turn them over (or the print is: print it again)", board, True
     if board.has_markers:
         yield from _other_first_ids(board, images)
     if board.kind == "aprilgrid":
@@ -86,7 +86,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
                     yield f"its markers are of another family: give --dictionary {dictionary}", marked, False
         yield "it has no markers: give --kind chessboard", replace(board, kind="chessboard", terraces=1), False
     else:
-        for columns, rows, why in (*_seen_sizes(board, images), *_sizes(board)):
+        for columns, rows, why in (*_visible_sizes(board, images), *_sizes(board)):
             sized = _possible(board, columns=columns, rows=rows)
             if sized is not None:
                 yield f"{why}: give --columns {columns} --rows {rows}", sized, False
@@ -94,7 +94,7 @@ def _others(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, 
     yield from _other_grids(board, images)
 
 
-def _seen_sizes(board: Board, images: Sequence[Gray]) -> Iterator[tuple[int, int, str]]:
+def _visible_sizes(board: Board, images: Sequence[Gray]) -> Iterator[tuple[int, int, str]]:
     """Numbers of squares of the chessboard that most images show, whatever they are said to be."""
     found = [each.size for each in (find_lattice(image) for image in images) if each is not None]
     if not found:
@@ -149,7 +149,7 @@ def _other_first_ids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str
     others = [_possible(board, first_id=first) for first in range(ids[0], max(ids[-1] - board.markers, -1), -1)]
     able = [each for each in others if each is not None]
     if board.kind == "aprilgrid":
-        seen = [detect_tags(_as_printed(image, board), board.border_bits) for image in images]
+        seen = [detect_tags(_undo_inversion(image, board), board.border_bits) for image in images]
         able.sort(key=lambda each: -sum(layout_agreement(outlines, each.tags) for outlines in seen))
     if able and able[0] != board:
         first = able[0].first_id
@@ -166,10 +166,10 @@ def _ids_seen(images: Sequence[Gray], board: Board) -> list[int]:
 def _markers_seen(images: Sequence[Gray], board: Board) -> list[Outlines]:
     """By image, the markers of a board's family, but for those that are seen too seldom to be trusted."""
     if board.kind == "aprilgrid":
-        found: list[Outlines] = [detect_tags(_as_printed(image, board), board.border_bits) for image in images]
+        found: list[Outlines] = [detect_tags(_undo_inversion(image, board), board.border_bits) for image in images]
     else:
         detector = cv2.aruco.ArucoDetector(_dictionary(board.family))
-        found = [_outlines(*detector.detectMarkers(_as_printed(image, board))[:2]) for image in images]
+        found = [_outlines(*detector.detectMarkers(_undo_inversion(image, board))[:2]) for image in images]
     counts = Counter(number for outlines in found for number in outlines)
     trusted = {number for number, count in counts.items() if count >= min(2, len(images))}
     return [{number: each for number, each in outlines.items() if number in trusted} for outlines in found]
@@ -181,7 +181,7 @@ def _outlines(corners: Sequence[Float32[np.ndarray, "1 4 2"]], ids: Int[np.ndarr
     return {number: each[0].astype(np.float64) for number, each in zip(numbers, corners, strict=True)}
 
 
-def _as_printed(image: Gray, board: Board) -> Gray:
+def _undo_inversion(image: Gray, board: Board) -> Gray:
     return 255 - image if board.inverted else image
 
 
@@ -191,15 +191,15 @@ def _dictionary(family: str) -> cv2.aruco.Dictionary:
 
 def _other_ids(images: Sequence[Gray], target: Target) -> str | None:
     """Where images show markers with ids that are none of a board's, or of several: which, and which it has."""
-    told = []
+    advice = []
     for family, board in {board.family: board for board in target.boards if board.has_markers}.items():
         own = {each for one in target.boards if one.family == family for each in one.ids}
         strange = [each for each in _ids_seen(images, board) if each not in own]
         if len(strange) >= _FEWEST_MARKERS:
             has = " and ".join(one.ids_told for one in target.boards if one.family == family)
             what = "these boards have" if len(target.boards) > 1 else "this board has"
-            told.append(f"markers of the family {family} with the ids {strange[0]}-{strange[-1]} found, {what} {has}")
-    return "; ".join(told) or None
+            advice.append(f"markers of the family {family} with the ids {strange[0]}-{strange[-1]} found, {what} {has}")
+    return "; ".join(advice) or None
 
 
 def _other_markers(images: Sequence[Gray], board: Board) -> str | None:
@@ -230,7 +230,7 @@ def _other_tags(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Boa
     pitch, steps = 1 + board.spacing_share, list[int]()
     ids = set[int]()
     for image in images:
-        outlines = detect_tags(_as_printed(image, board), board.border_bits)
+        outlines = detect_tags(_undo_inversion(image, board), board.border_bits)
         above = {tag: tag_beside(outlines, tag, ABOVE, pitch) for tag in outlines}
         steps += [other - tag for tag, other in above.items() if other is not None]
         ids |= set(outlines)
@@ -245,8 +245,8 @@ def _other_tags(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Boa
 
 def _other_grids(board: Board, images: Sequence[Gray]) -> Iterator[tuple[str, Board, bool]]:
     """The grid of circles, or the chessboard, that most images show."""
-    shown = [_as_printed(image, board) for image in images]
-    grids = Counter(each for each in map(seen_grid, shown) if each is not None)
+    shown = [_undo_inversion(image, board) for image in images]
+    grids = Counter(each for each in map(recognize_grid, shown) if each is not None)
     squares = Counter(each.size for each in map(find_lattice, images) if each is not None)
     for (kind, columns, rows), count in grids.most_common(1):
         other = _possible(board, kind=kind, columns=columns, rows=rows)

@@ -73,7 +73,7 @@ def find_circles(
     return None if found is None else found[:2]
 
 
-def measured_share(image: UInt8[np.ndarray, "h w"], board: Board) -> float | None:
+def measure_circle_share(image: UInt8[np.ndarray, "h w"], board: Board) -> float | None:
     """Diameter of the circles that an image shows, as a share of the distance to the nearest one, by the area of each
     and how large the grid is there; None where it does not show the board, or they are small."""
     found = _measure_circles(image, board)
@@ -106,7 +106,7 @@ def _measure_circles(
     return numbers[known], exact[known, :2], exact[known, 2]
 
 
-def seen_grid(image: UInt8[np.ndarray, "h w"]) -> tuple[BoardKind, int, int] | None:
+def recognize_grid(image: UInt8[np.ndarray, "h w"]) -> tuple[BoardKind, int, int] | None:
     """The kind of grid of circles that an image shows, its columns and its rows, the greater number first where it has
     both; None where it shows none."""
     cells = _largest_lattice(_find_blobs(image))
@@ -194,7 +194,7 @@ def _fill_lattice(blobs: _Blobs, tree: cKDTree, cells: dict[Cell, int]) -> dict[
                 continue
             affine = np.linalg.lstsq(design, pixels[near], rcond=None)[0]
             step_px = float(np.linalg.norm(affine[:2], axis=1).min())
-            blob = _nearest(blobs, tree, np.array([*cell, 1.0]) @ affine, step_px, cells[_as_cell(places[near[0]])])
+            blob = _nearest(blobs, tree, np.array([*cell, 1.0]) @ affine, step_px, cells[_to_cell(places[near[0]])])
             if blob is not None and blob not in used:
                 cells[cell] = blob
                 used.add(blob)
@@ -208,7 +208,7 @@ def _empty_neighbours(cells: dict[Cell, int]) -> list[Cell]:
     return sorted(beside - set(cells))
 
 
-def _as_cell(place: Int[np.ndarray, "2"]) -> Cell:
+def _to_cell(place: Int[np.ndarray, "2"]) -> Cell:
     return int(place[0]), int(place[1])
 
 

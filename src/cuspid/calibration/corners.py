@@ -59,7 +59,7 @@ def find_corners(gray: UInt8[np.ndarray, "h w"], target: Target) -> BoardView | 
         found = [find_corners(gray, each) for each in target.boards]
         shown = [(view, start) for view, start in zip(found, target.starts, strict=False) if view is not None]
         return _unite_views([BoardView(view.corner + start, view.pixels) for view, start in shown])
-    return _found_alone(gray, target)
+    return _find_on_board(gray, target)
 
 
 def _unite_views(views: list[BoardView]) -> BoardView | None:
@@ -75,24 +75,24 @@ def split_by_board(view: BoardView, target: Target) -> list[BoardView]:
     return [BoardView(view.corner[number == k], view.pixels[number == k]) for k in np.unique(number)]
 
 
-def _found_alone(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
+def _find_on_board(gray: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
     image = 255 - gray if board.inverted else gray
     found = _FINDERS[board.kind](image, board)
-    return found if found is not None and _tells(found, board) else None
+    return found if found is not None and _determines_pose(found, board) else None
 
 
 def pieces(view: BoardView, board: Target) -> list[BoardView]:
-    """The flat parts of a view, terrace by terrace or board by board, of which each tells something by itself."""
+    """The flat parts of a view, terrace by terrace or board by board, each of which determines a pose by itself."""
     if isinstance(board, BoardSet):
         return split_by_board(view, board)
     terrace = board.terrace_at(board.corners[view.corner, 0])
     parts = [BoardView(view.corner[terrace == k], view.pixels[terrace == k]) for k in range(board.terraces)]
-    return [part for part in parts if _tells(part, board)]
+    return [part for part in parts if _determines_pose(part, board)]
 
 
-def _tells(view: BoardView, board: Board) -> bool:
+def _determines_pose(view: BoardView, board: Board) -> bool:
     """Whether it has enough corners, and these do not lie on a line."""
-    return len(view.corner) >= LEAST_CORNERS and not _on_a_line(board.corners[view.corner, :2])
+    return len(view.corner) >= LEAST_CORNERS and not _is_collinear(board.corners[view.corner, :2])
 
 
 def _charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
@@ -109,18 +109,18 @@ def _chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | No
     size = (board.columns - 1, board.rows - 1)
     found, pixels = cv2.findChessboardCornersSB(image, size)
     if found:
-        return _whole(image, pixels, size)
+        return _verify_chessboard(image, pixels, size)
     lattice = find_lattice(image)
     if lattice is None or not is_as_large(lattice, board):
         # Of a larger chessboard it would find a part.
-        return None if lattice is not None and is_larger(lattice, board) else _exhaustively(image, size)
+        return None if lattice is not None and is_larger(lattice, board) else _search_exhaustively(image, size)
     return _view(lattice.number_corners(board))
 
 
-def _exhaustively(image: UInt8[np.ndarray, "h w"], size: tuple[int, int]) -> BoardView | None:
+def _search_exhaustively(image: UInt8[np.ndarray, "h w"], size: tuple[int, int]) -> BoardView | None:
     """With the one flag of OpenCV's that does not find boards where there are none."""
     found, pixels = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_EXHAUSTIVE)
-    return _whole(image, pixels, size) if found else None
+    return _verify_chessboard(image, pixels, size) if found else None
 
 
 def _tags(image: UInt8[np.ndarray, "h w"], board: Board) -> BoardView | None:
@@ -136,7 +136,7 @@ def _view(found: tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"]] | None) -
     return None if found is None else BoardView(found[0], found[1] + OPENCV_PIXEL_OFFSET)
 
 
-def _whole(
+def _verify_chessboard(
     image: UInt8[np.ndarray, "h w"], pixels: Float32[np.ndarray, "n 1 2"], size: tuple[int, int]
 ) -> BoardView | None:
     """What OpenCV has found; None where it is not a board."""
@@ -171,7 +171,7 @@ def _alternates_beyond(image: UInt8[np.ndarray, "h w"], grid: Float32[np.ndarray
     return within is None or all(each is None or each * np.sign(within) > _ALIKE * abs(within) for each in around)
 
 
-def _on_a_line(points: Float[np.ndarray, "n 2"]) -> bool:
+def _is_collinear(points: Float[np.ndarray, "n 2"]) -> bool:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[1] < 0.1 * spread[0])
 

@@ -1,4 +1,4 @@
-"""What views of a board still lack for a calibration, told while they are taken.
+"""What the views of a board still lack for a calibration, reported while they are taken.
 
 A lens is known where corners were seen, focal lengths by tilted views, and both by views from several distances; places
 of cameras by boards that they saw together. The lenses are not known yet: tilts and distances are read from the plane
@@ -22,7 +22,7 @@ from cuspid.model.board import Target
 from cuspid.runtime.options import Options, Range
 
 CELLS = 6
-"""Of an image, each way."""
+"""Number of cells along each side of an image."""
 SIDES = ("left", "right", "top", "bottom")
 """Which side of the board, as the image shows it, is nearer to the camera."""
 _ROWS, _COLUMNS = ("top", "middle", "bottom"), ("left", "centre", "right")
@@ -45,7 +45,7 @@ class CoverageOptions(Options):
     views_of_tilt: Annotated[int, Range(0, 1000)] = 2
     """Views with each of the four sides of the board nearer."""
     min_tilt_deg: Annotated[float, Range(1, 70)] = 18.0
-    """From which tilt on a side counts as nearer."""
+    """Tilt from which one side of the board counts as nearer."""
     distance_ratio: Annotated[float, Range(1, 100)] = 1.2
     """How much farther the farthest view must be than the nearest."""
     shared_instants: Annotated[int, Range(1, 10_000)] = 5
@@ -117,8 +117,8 @@ class Coverage:
 
 def focal_px_of(homographies: Sequence[Float[np.ndarray, "3 3"]], width: int) -> float:
     """About the focal length of a camera of square pixels, from homographies between a plane and its image, whose
-    origin is the principal point (Z. Zhang, IEEE PAMI 22, 2000, with all else known). Views that face the camera tell
-    nothing; where there are no others, that of a usual lens.
+    origin is the principal point (Z. Zhang, IEEE PAMI 22, 2000, with all else known). Views parallel to the image carry
+    no information; where there are no others, that of a usual lens.
 
     Each gives two equations a s + b = 0 for s = 1 / f^2, of the orthogonality and of the equal length of two axes.
     """
@@ -146,8 +146,8 @@ def tilt_of(homography: Float[np.ndarray, "3 3"], focal_px: float) -> tuple[floa
 
 
 def homography_of(view: BoardView, board: Target, size: tuple[int, int]) -> Float[np.ndarray, "3 3"] | None:
-    """From places on the board that is seen best (mm, from its middle) to the image (px, from the middle of the image);
-    None where the corners do not tell."""
+    """Homography from the board that is seen best (mm, from its middle) to the image (px, from the middle of the
+    image); None where the corners do not determine it."""
     part = max(pieces(view, board), key=lambda each: len(each.corner), default=view)
     number = board.board_of(np.arange(len(board.corners)))
     middle = board.corners[number == board.board_of(part.corner)[0], :2].mean(axis=0)
@@ -181,20 +181,20 @@ def _with_view(camera: CameraCoverage, view: BoardView, board: Target) -> Camera
 
 
 def _missing_of(camera: CameraCoverage, options: CoverageOptions) -> list[str]:
-    said = []
+    lacks = []
     if camera.views < options.views:
-        said.append(f"{options.views - camera.views} views")
-    said += [f"corners {place}" for place in _places(camera.cells < options.views_of_cell)]
+        lacks.append(f"{options.views - camera.views} views")
+    lacks += [f"corners {place}" for place in _places(camera.cells < options.views_of_cell)]
     focal_px = focal_px_of(camera.homographies, camera.size[0])
     poses = [tilt_of(each, focal_px) for each in camera.homographies]
     sides = [side for tilt_deg, side, _ in poses if options.min_tilt_deg <= tilt_deg <= _MOST_TILT_DEG]
     tilts = [side for side in SIDES if sides.count(side) < options.views_of_tilt]
     if tilts:
-        said.append(f"tilts with the {' / '.join(tilts)} nearer")
+        lacks.append(f"tilts with the {' / '.join(tilts)} nearer")
     distances = [distance for _, _, distance in poses]
     if distances and max(distances) < options.distance_ratio * min(distances):
-        said.append("another distance")
-    return said
+        lacks.append("another distance")
+    return lacks
 
 
 def _places(lacking: np.ndarray) -> Sequence[str]:

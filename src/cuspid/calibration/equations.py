@@ -38,7 +38,7 @@ class Layout:
 
     @staticmethod
     def of(columns: Int[np.ndarray, "n w"], starts: Int[np.ndarray, "s"], count: int) -> Layout:
-        """Of corners in the order of their views."""
+        """The layout for corners in the order of their views."""
         places, own = np.empty_like(columns), []
         for begin, end in pairwise(starts.tolist()):
             known = np.unique(columns[begin:end])
@@ -129,7 +129,7 @@ def _gradient(values, residuals, columns, out):
 def between_motions(
     values: Float[np.ndarray, "n 2 w"], by_motion: Float[np.ndarray, "n 2 6"], layout: Layout
 ) -> Float[np.ndarray, "t 6"]:
-    """Of the unknowns of each view (``layout.unknowns``) and its motion, in the matrix of the normal equations."""
+    """Blocks of the normal matrix between the unknowns of each view (``layout.unknowns``) and its motion."""
     out = np.zeros((len(layout.unknowns), _PLACE))
     _between_motions(values, by_motion, layout.places, layout.starts, layout.first, out)
     return out

@@ -1,5 +1,5 @@
-"""From the images of a board to a calibrated handpiece: find the board in each, calibrate the rig, and then what the
-cameras make of light."""
+"""Calibrates a handpiece from images of a board: finds the board in each, calibrates the rig, and then its
+photometry."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from cuspid.calibration.calibrate import CalibrationOptions, RigCalibration, calibrate_rig, in_frame_of, size_notes
 from cuspid.calibration.causes import MOST_TRIED, cause_of_absence, is_part_of_a_larger_one
-from cuspid.calibration.circle_centres import measured_share
+from cuspid.calibration.circle_centres import measure_circle_share
 from cuspid.calibration.corners import BoardView, Views, find_corners
 from cuspid.calibration.instants import common_instants
 from cuspid.calibration.photometry import Photometry, PhotometryOptions, calibrate_light, look_at_patches
@@ -56,10 +56,10 @@ def calibrate(
     """Calibrate the cameras of a rig from the images that each, by name, took of a board. Those of one instant share a
     name, or the number in it.
 
-    ``drawn``: the handpiece as it was designed, whose lights, and no others, lit the board.
-    ``working_distance_mm``: from the cameras to the teeth; by default that of the drawn handpiece, or else the median
-    distance of the board. Raises ReconstructionError, which names the cause, where a camera hardly saw the board as it
-    was described, and InputError where nothing tells which images were taken together.
+    ``drawn``: the handpiece as it was designed, whose lights, and no others, lit the board. ``working_distance_mm``:
+    from the cameras to the teeth; by default that of the drawn handpiece, or else the median distance of the board.
+    Raises ReconstructionError, which names the cause, where a camera hardly saw the board as it was described, and
+    InputError where nothing shows which images were taken together.
     """
     _require_images(images)
     images, named_notes = _match_frames(images)
@@ -75,7 +75,7 @@ def calibrate(
     if photometry.photometry and isinstance(board, Board):
         light = _light(found, images, board, drawn, photometry, progress)
     read = (note for each in images.values() for note in each.notes)
-    found = replace(found, notes=(*read, *named_notes, *_unseen(images, views), *drawn_notes, *found.notes))
+    found = replace(found, notes=(*read, *named_notes, *_missed_board_notes(images, views), *drawn_notes, *found.notes))
     return Calibration(handpiece=_handpiece(found, light, drawn, working_distance_mm), rig=found, light=light)
 
 
@@ -151,12 +151,12 @@ def _require_views(sequences: Mapping[str, ImageSequence], views: Views, board: 
         seen = [index for index, instant in enumerate(sequence.names) if (name, instant) in views]
         unseen = [index for index in range(len(sequence)) if index not in set(seen)]
         if len(seen) >= LEAST_VIEWS:
-            if isinstance(board, Board) and is_part_of_a_larger_one(_some(sequence, seen), board):
+            if isinstance(board, Board) and is_part_of_a_larger_one(_sample_images(sequence, seen), board):
                 raise ReconstructionError(
                     f"calibration: the board in the images of camera {name} has a square more each way; the corners "
                     f"were counted, not the squares: give --columns {board.columns + 1} --rows {board.rows + 1}"
                 )
-        elif (cause := cause_of_absence(_some(sequence, unseen), board)) is not None:
+        elif (cause := cause_of_absence(_sample_images(sequence, unseen), board)) is not None:
             raise ReconstructionError(
                 f"calibration: the board is found in {len(seen)} of {len(sequence)} images of camera {name}; {cause}"
             )
@@ -168,7 +168,11 @@ def _other_circles(sequences: Mapping[str, ImageSequence], views: Views, board: 
         return
     name, sequence = next(iter(sequences.items()))
     seen = [index for index, instant in enumerate(sequence.names) if (name, instant) in views]
-    shares = [each for each in (measured_share(image, board) for image in _some(sequence, seen)) if each is not None]
+    shares = [
+        each
+        for each in (measure_circle_share(image, board) for image in _sample_images(sequence, seen))
+        if each is not None
+    ]
     share = float(np.median(shares)) if shares else board.circle_share
     if abs(share / board.circle_share - 1) > _OTHER_CIRCLES:
         yield (
@@ -177,13 +181,13 @@ def _other_circles(sequences: Mapping[str, ImageSequence], views: Views, board: 
         )
 
 
-def _some(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:
+def _sample_images(sequence: ImageSequence, indices: Sequence[int]) -> list[UInt8[np.ndarray, "h w"]]:
     """A few of some images, evenly, in grey."""
     tried = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, MOST_TRIED).astype(int))] if indices else []
     return [full_range_grey(sequence.fine_image(index)) for index in tried]
 
 
-def _unseen(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[str]:
+def _missed_board_notes(sequences: Mapping[str, ImageSequence], views: Views) -> Iterator[str]:
     """In which images the board was not found."""
     for name, sequence in sequences.items():
         unseen = [instant for instant in sequence.names if (name, instant) not in views]

@@ -12,14 +12,15 @@ _DIGITS = re.compile(r"\d+")
 
 
 def common_instants(names: Mapping[str, Sequence[str]]) -> Mapping[str, tuple[str, ...]] | None:
-    """By camera, the instant of each of its images, given their names; None if the names themselves are the instants.
+    """The instant of each image, by camera, from the names of the images; None if the names themselves are the
+    instants.
 
     Raises InputError where no two cameras have an image of the same name, nor of the same number.
     """
-    if len(names) < 2 or _have_common(names):
+    if len(names) < 2 or _share_instants(names):
         return None
     numbers = {camera: numbers_in(each) for camera, each in names.items()}
-    if any(each is None for each in numbers.values()) or not _have_common(numbers):
+    if any(each is None for each in numbers.values()) or not _share_instants(numbers):
         shown = ", ".join(f"{camera}: {each[0]}" for camera, each in names.items() if each)
         raise InputError(
             "calibration: no two cameras have an image of the same name, or with the same number in it; images that "
@@ -32,7 +33,7 @@ def common_instants(names: Mapping[str, Sequence[str]]) -> Mapping[str, tuple[st
     }
 
 
-def _have_common(names: Mapping[str, Sequence[object] | None]) -> bool:
+def _share_instants(names: Mapping[str, Sequence[object] | None]) -> bool:
     seen = [set(each or ()) for each in names.values()]
     return len(set().union(*seen)) < sum(map(len, seen))
 

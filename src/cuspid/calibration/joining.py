@@ -18,7 +18,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.calibration.agreement import agreed_on, disagreement_between
+from cuspid.calibration.agreement import consensus_motion, disagreement_between
 from cuspid.calibration.bundle import BoardScene
 from cuspid.calibration.corners import BoardView, Views, split_by_board
 from cuspid.calibration.start import board_pose
@@ -71,7 +71,7 @@ class _Groups:
         """Numbers of the boards of a group, from 0."""
         return [number for number, (own, _) in self.board.items() if own == group]
 
-    def joined_cameras(self, first: int, second: int, first_from_second: Rigid3) -> _Groups:
+    def merge_cameras(self, first: int, second: int, first_from_second: Rigid3) -> _Groups:
         """With two groups of cameras as one."""
         moved = {
             name: (first, first_from_second @ place) if group == second else (group, place)
@@ -79,7 +79,7 @@ class _Groups:
         }
         return replace(self, camera=moved)
 
-    def joined_boards(self, first: int, second: int, first_from_second: Rigid3) -> _Groups:
+    def merge_boards(self, first: int, second: int, first_from_second: Rigid3) -> _Groups:
         """With two groups of boards as one."""
         moved = {
             number: (first, first_from_second @ place) if group == second else (group, place)
@@ -88,7 +88,7 @@ class _Groups:
         return replace(self, board=moved)
 
 
-def joined_boards(
+def join_boards(
     views: Views, target: BoardSet, cameras: Mapping[str, Camera]
 ) -> tuple[BoardScene, dict[tuple[str, str], BoardView], tuple[str, ...]]:
     """The cameras in the frame of the first one, the boards on their body, and that body at each instant; the views of
@@ -96,7 +96,7 @@ def joined_boards(
 
     Raises ReconstructionError where cameras cannot be joined, or boards or cameras moved against each other.
     """
-    seen = list(_all_seen(views, target, cameras))
+    seen = list(_estimate_board_poses(views, target, cameras))
     boards = sorted({each.board for each in seen})
     groups = _Groups(
         camera={name: (k, Rigid3.identity()) for k, name in enumerate(cameras)},
@@ -126,7 +126,7 @@ def joined_boards(
     return scene, {key: view for key, view in views.items() if key in kept}, groups.notes
 
 
-def _all_seen(views: Views, target: BoardSet, cameras: Mapping[str, Camera]) -> Collection[_Seen]:
+def _estimate_board_poses(views: Views, target: BoardSet, cameras: Mapping[str, Camera]) -> Collection[_Seen]:
     found = []
     for (camera, instant), view in views.items():
         for part in split_by_board(view, target):
@@ -149,20 +149,20 @@ def _join_two_groups(groups: _Groups, seen: Sequence[_Seen]) -> _Groups | None:
             if count:
                 shared.append((count, kind, one, other))
     if not shared:
-        return _joined_by_motion(groups, poses)
+        return _join_by_motion(groups, poses)
     _, kind, one, other = max(shared, key=lambda each: each[0])
     side = 0 if kind == "cameras" else 1
-    said = _estimate_hand_eye(poses, one, other, side)
+    candidates = _estimate_hand_eye(poses, one, other, side)
     away = [pose.translation for each in poses.values() for pose in each.values()]
     distance_mm = float(np.median(np.linalg.norm(away, axis=1)))
-    best, agreeing, _ = agreed_on([[each] for each in said], distance_mm)
-    if 2 * agreeing < len(said):
+    best, agreeing, _ = consensus_motion([[each] for each in candidates], distance_mm)
+    if 2 * agreeing < len(candidates):
         if kind == "boards":
-            raise ReconstructionError(_disagreement(groups, one, other, agreeing, len(said)))
+            raise ReconstructionError(_disagreement(groups, one, other, agreeing, len(candidates)))
         named = ", ".join(groups.cameras_of(other)), ", ".join(groups.cameras_of(one))
         own = _poses_to_compare(poses, other, one)
-        raise ReconstructionError(disagreement_between(named, own, agreeing, len(said), distance_mm))
-    return groups.joined_cameras(one, other, best) if side == 0 else groups.joined_boards(one, other, best)
+        raise ReconstructionError(disagreement_between(named, own, agreeing, len(candidates), distance_mm))
+    return groups.merge_cameras(one, other, best) if side == 0 else groups.merge_boards(one, other, best)
 
 
 def _estimate_hand_eye(
@@ -170,13 +170,15 @@ def _estimate_hand_eye(
 ) -> list[Rigid3]:
     """``one_from_other`` of two groups of cameras (``side`` 0) or of boards (1), as each instant says at which both
     saw, or were seen by, the same group."""
-    said = []
+    candidates = []
     for key, first in poses.items():
         second = poses.get((other, key[1]) if side == 0 else (key[0], other), {})
         if key[side] == one:
             both = sorted(set(first) & set(second))
-            said += [first[i] @ second[i].inverse() if side == 0 else first[i].inverse() @ second[i] for i in both]
-    return said
+            candidates += [
+                first[i] @ second[i].inverse() if side == 0 else first[i].inverse() @ second[i] for i in both
+            ]
+    return candidates
 
 
 def _poses_to_compare(
@@ -204,7 +206,7 @@ def _numbers(boards: Sequence[int]) -> str:
 # --- by motion ---------------------------------------------------------------------------------------------------
 
 
-def _joined_by_motion(groups: _Groups, poses: Mapping[tuple[int, int], Mapping[str, Rigid3]]) -> _Groups | None:
+def _join_by_motion(groups: _Groups, poses: Mapping[tuple[int, int], Mapping[str, Rigid3]]) -> _Groups | None:
     """Two groups of cameras, and the boards that they saw, joined by how both moved; None where no two moved together.
 
     Raises ReconstructionError where they turned too little.
@@ -233,12 +235,12 @@ def _joined_by_motion(groups: _Groups, poses: Mapping[tuple[int, int], Mapping[s
         f"{len(instants)} instants ({turn_deg:.0f} degrees about the second axis, RMS); the boards must not have moved "
         "against each other"
     )
-    grown = groups.joined_cameras(one[0], other[0], cameras).joined_boards(one[1], other[1], boards)
+    grown = groups.merge_cameras(one[0], other[0], cameras).merge_boards(one[1], other[1], boards)
     return replace(grown, notes=(*groups.notes, note))
 
 
 def second_turn_deg(poses: Sequence[Rigid3]) -> float:
-    """By how much poses are turned about the second of the axes about which they are turned most, RMS."""
+    """RMS rotation of poses about the second of their principal axes of rotation."""
     vectors = np.stack([(pose @ poses[0].inverse()).rotation_vector for pose in poses])
     values = np.linalg.svd(vectors - vectors.mean(axis=0), compute_uv=False)
     return float(np.rad2deg(values[1] / np.sqrt(len(poses))))

@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.calibration.bundle import Adjusted, adjust_board, in_front, of_instants
+from cuspid.calibration.bundle import Adjusted, adjust_board, select_instants, views_in_front
 from cuspid.calibration.corners import BoardView
-from cuspid.calibration.start import LEAST_VIEWS, calibrated_alone
+from cuspid.calibration.start import LEAST_VIEWS, calibrate_single_camera
 from cuspid.geometry.cameras import GRID, MODELS
 from cuspid.model.board import Target
 from cuspid.model.camera import Camera
@@ -53,7 +53,7 @@ class LensChoice:
     """The one that was taken."""
     held_out_px: Mapping[str, float]
     """RMS of the residuals in views that a calibration by a model was not made from; empty where there were too few
-    views to tell."""
+    views."""
     chosen: Camera | None = None
     """The camera by the one that was taken, and"""
     rival: Camera | None = None
@@ -61,37 +61,37 @@ class LensChoice:
 
     @property
     def summary(self) -> str:
-        """In words, with the figures."""
-        told = ", ".join(f"{model} {px:.3f}" for model, px in self.held_out_px.items())
-        return f"{self.model}" + (f" (px in views held out: {told})" if told else "")
+        """One line with the errors that decided."""
+        errors = ", ".join(f"{model} {px:.3f}" for model, px in self.held_out_px.items())
+        return f"{self.model}" + (f" (px in views held out: {errors})" if errors else "")
 
 
 def choose_lens(
-    views: Sequence[BoardView], board: Target, size: tuple[int, int], asked: LensName = "auto"
+    views: Sequence[BoardView], board: Target, size: tuple[int, int], requested: LensName = "auto"
 ) -> tuple[LensChoice, Adjusted]:
     """The model that is asked for or that the views call for, and the camera by it, calibrated alone.
 
     Raises ReconstructionError where no camera fits the views.
     """
-    if asked != "auto":
-        model = _SPLINED if asked == "splined" else asked
-        alone = calibrated_as(model, views, board, size)
+    if requested != "auto":
+        model = _SPLINED if requested == "splined" else requested
+        alone = calibrate_model(model, views, board, size)
         sound = _sound(views, alone)
         if len(sound) < len(views):
-            alone = calibrated_as(model, sound, board, size)
+            alone = calibrate_model(model, sound, board, size)
         return LensChoice(model=model, held_out_px={}), alone
     choice, simple = _first_that_fits(views, board, size)
     sound = _sound(views, simple)
     if len(sound) < 2 * LEAST_VIEWS:
         return choice, simple
-    some = _some(sound)
+    some = _sample_views(sound)
     found, squares = dict[str, Adjusted](), dict[str, Float[np.ndarray, "v"]]()
     for model in _LADDER:
-        if model == _LADDER[-1] and not _is_worth_more(squares):
+        if model == _LADDER[-1] and not _improves_on_simplest(squares):
             break
         try:
-            found[model] = calibrated_as(model, some, board, size, found.get(_LADDER[0]))
-            squares[model] = _held_out(found[model], some, board)
+            found[model] = calibrate_model(model, some, board, size, found.get(_LADDER[0]))
+            squares[model] = _cross_validate(found[model], some, board)
         except ReconstructionError:  # not such a lens
             continue
     if not squares:
@@ -113,13 +113,13 @@ def choose_lens(
     if len(some) == len(sound):
         return taken, found[chosen]
     try:
-        alone = calibrated_alone(sound, board, size, [found[chosen].scene.cameras[""]])
+        alone = calibrate_single_camera(sound, board, size, [found[chosen].scene.cameras[""]])
     except ReconstructionError:  # the others lie where such a lens shows nothing
         return choice, simple
     return taken, alone
 
 
-def splined_where_earned(
+def select_splined_lens(
     choice: LensChoice, camera: Camera, views: Sequence[BoardView], board: Target
 ) -> tuple[LensChoice, Camera] | None:
     """A splined lens instead of a camera's, where its views call for it; they are as if all rows were exposed at once,
@@ -127,15 +127,15 @@ def splined_where_earned(
 
     What is left out at a time are views that follow each other: in a film the next one is almost the same.
     """
-    some, size = _some(views), (camera.width, camera.height)
+    some, size = _sample_views(views), (camera.width, camera.height)
     if len(some) < 2 * LEAST_VIEWS:
         return None
     try:
-        base = calibrated_alone(some, board, size, [camera])
+        base = calibrate_single_camera(some, board, size, [camera])
         if _common_pattern(base, some) <= _PATTERN:
             return None
-        splined = calibrated_as(_SPLINED, some, board, size)
-        before, after = (_held_out(each, some, board, runs=True) for each in (base, splined))
+        splined = calibrate_model(_SPLINED, some, board, size)
+        before, after = (_cross_validate(each, some, board, runs=True) for each in (base, splined))
     except ReconstructionError:  # not such a lens
         return None
     if not _is_better(after, before):
@@ -146,7 +146,7 @@ def splined_where_earned(
     return LensChoice(model=_SPLINED, held_out_px=held_out, chosen=found, rival=rival), found
 
 
-def _some(views: Sequence[BoardView]) -> list[BoardView]:
+def _sample_views(views: Sequence[BoardView]) -> list[BoardView]:
     """Not too many of some views, evenly."""
     return [views[k] for k in np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).astype(int))]
 
@@ -185,22 +185,22 @@ def _sound(views: Sequence[BoardView], found: Adjusted) -> list[BoardView]:
 def _first_that_fits(views: Sequence[BoardView], board: Target, size: tuple[int, int]) -> tuple[LensChoice, Adjusted]:
     """One of the two simplest models: of few views more cannot be told."""
     try:
-        return LensChoice(model="OPENCV", held_out_px={}), calibrated_as("OPENCV", views, board, size)
+        return LensChoice(model="OPENCV", held_out_px={}), calibrate_model("OPENCV", views, board, size)
     except ReconstructionError as error:
         try:
-            found = calibrated_as("OPENCV_FISHEYE", views, board, size)
+            found = calibrate_model("OPENCV_FISHEYE", views, board, size)
         except ReconstructionError:
             raise error from None
         return LensChoice(model="OPENCV_FISHEYE", held_out_px={}), found
 
 
-def _is_worth_more(squares: Mapping[str, Float[np.ndarray, "v"]]) -> bool:
+def _improves_on_simplest(squares: Mapping[str, Float[np.ndarray, "v"]]) -> bool:
     """Whether another model than the simplest one was better, or the only one that fits."""
     first = squares.get(_LADDER[0])
     return first is None or any(_is_better(each, first) for each in squares.values())
 
 
-def calibrated_as(
+def calibrate_model(
     model: str, views: Sequence[BoardView], board: Target, size: tuple[int, int], simple: Adjusted | None = None
 ) -> Adjusted:
     """One camera of a model from its own views; ``simple``, if it is known, is the same by OPENCV.
@@ -208,18 +208,18 @@ def calibrated_as(
     Raises ReconstructionError where the views fit no such camera.
     """
     if model == "OPENCV":
-        return calibrated_alone(views, board, size)
+        return calibrate_single_camera(views, board, size)
     if model == _SPLINED:
-        base = calibrated_as(_ITS_BASE, views, board, size, simple)
+        base = calibrate_model(_ITS_BASE, views, board, size, simple)
         seen = np.concatenate([view.pixels for view in views])
-        return calibrated_alone(views, board, size, [with_spline(base.scene.cameras[""], seen)])
+        return calibrate_single_camera(views, board, size, [with_spline(base.scene.cameras[""], seen)])
     try:
-        simple = simple or calibrated_alone(views, board, size)
+        simple = simple or calibrate_single_camera(views, board, size)
         pixels = np.concatenate([view.pixels for view in views])
         starts = [as_model(simple.scene.cameras[""], model, pixels)]
     except (InputError, ReconstructionError):  # too far from such a lens
         starts = [_ideal(model, size, half_deg) for half_deg in _HALF_VIEWS_DEG]
-    return calibrated_alone(views, board, size, starts)
+    return calibrate_single_camera(views, board, size, starts)
 
 
 def as_model(camera: Camera, model: str, pixels: Float[np.ndarray, "n 2"]) -> Camera:
@@ -264,7 +264,7 @@ def _ideal(model: str, size: tuple[int, int], half_deg: float) -> Camera:
     )
 
 
-def _held_out(
+def _cross_validate(
     found: Adjusted, views: Sequence[BoardView], board: Target, *, runs: bool = False
 ) -> Float[np.ndarray, "v"]:
     """Mean square of the residuals of each view by cameras that were calibrated without it, and without every fourth
@@ -279,13 +279,13 @@ def _held_out(
         rest = {key: view for key, view in named.items() if key not in out}
         if not out:
             continue
-        seen = adjust_board(of_instants(scene, {instant for _, instant in rest}), rest, board)
-        held = replace(seen.scene, rig_from_board=of_instants(scene, {key[1] for key in out}).rig_from_board)
-        shown = in_front(held, out, board)
+        seen = adjust_board(select_instants(scene, {instant for _, instant in rest}), rest, board)
+        held = replace(seen.scene, rig_from_board=select_instants(scene, {key[1] for key in out}).rig_from_board)
+        shown = views_in_front(held, out, board)
         squares[[int(instant) for _, instant in out if ("", instant) not in shown]] = np.inf
         if not shown:
             continue
-        held = of_instants(held, {instant for _, instant in shown})
+        held = select_instants(held, {instant for _, instant in shown})
         for (_, instant), residuals in adjust_board(held, shown, board, only_boards=True).residuals.items():
             squares[int(instant)] = np.mean(residuals**2)
     return squares

@@ -53,7 +53,7 @@ def noise_of(patches: Patches) -> Noise:
     """A line fitted to the variances of patches over their levels; each is weighted by how well it is known (the
     variance of a variance goes with its square), and variances that are far too large are left out."""
     by = np.column_stack([np.ones(len(patches.level_dn)), patches.level_dn])
-    expected = _usual(patches)
+    expected = _median_variance(patches)
     for _ in range(_ROUNDS):
         weight = (patches.variance_dn2 < _TOO_MUCH * expected) / expected**2
         matrix = (by * weight[:, None]).T @ by
@@ -71,7 +71,7 @@ def noise_of(patches: Patches) -> Noise:
     )
 
 
-def _usual(patches: Patches) -> Float[np.ndarray, "n"]:
+def _median_variance(patches: Patches) -> Float[np.ndarray, "n"]:
     """The median variance of patches of the same tone."""
     usual = np.zeros(len(patches.dark))
     for tone in np.unique(patches.dark):

@@ -86,7 +86,7 @@ class Patches:
         return Patches(**{each.name: getattr(self, each.name)[chosen] for each in fields(self)})
 
 
-def joined_patches(parts: Sequence[Patches]) -> Patches:
+def join_patches(parts: Sequence[Patches]) -> Patches:
     """All patches of several sets, in order."""
     return Patches(**{each.name: np.concatenate([getattr(p, each.name) for p in parts]) for each in fields(Patches)})
 
@@ -94,8 +94,8 @@ def joined_patches(parts: Sequence[Patches]) -> Patches:
 def clear_places(board: Board) -> Places:
     """The centres of uniform areas: the cells of a fine grid with the largest clearance, none next to another."""
     dark = _cells(board)
-    far = np.where(dark, _to_edge(dark), _to_edge(~dark))
-    far = np.minimum(far, _to_step(board, far.shape[1])[None])
+    far = np.where(dark, _distance_to_edge(dark), _distance_to_edge(~dark))
+    far = np.minimum(far, _distance_to_step(board, far.shape[1])[None])
     ridge = far + 1e-3 * np.random.default_rng(0).random(far.shape, dtype=np.float32)  # one of a row that is all alike
     size = 2 * _APART + 1
     clear = (ridge == cv2.dilate(ridge, np.ones((size, size), np.uint8))) & (far > _LEAST_CELLS)
@@ -114,14 +114,14 @@ def _cells(board: Board) -> Bool[np.ndarray, "h w"]:
     return board.is_dark(points).reshape(len(down), len(across))
 
 
-def _to_edge(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _distance_to_edge(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Distance of each cell that is inside to those that are not, the border of the board included; in cells."""
     framed = np.pad(inside.astype(np.uint8), 1)
     found = cv2.distanceTransform(framed, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     return np.asarray(np.maximum(found - _HALF_CELL, 0))
 
 
-def _to_step(board: Board, columns: int) -> Float[np.ndarray, "w"]:
+def _distance_to_step(board: Board, columns: int) -> Float[np.ndarray, "w"]:
     """Distance of each column of cells to the next edge of a step, of those in front of a riser to where that hides
     nothing in a view of 45 degrees; in cells."""
     x = (np.arange(columns) + 0.5) * (board.square_mm / _CELLS)
@@ -143,9 +143,9 @@ def patches_of(
     options: PatchOptions,
 ) -> Patches:
     """The patches of an image around the corners that were found in it."""
-    points = on_board(board, places.points, bending_mm)
+    points = points_on_board(board, places.points, bending_mm)
     pixels = camera.project(cam_from_board.apply(points))
-    inside = camera.contains(pixels, options.clear_px) & _in_squares(board, corner, places.points)
+    inside = camera.contains(pixels, options.clear_px) & _is_beside_corner(board, corner, places.points)
     scale = _smallest_scale(camera, cam_from_board, points, places.clearance_mm)
     chosen = np.flatnonzero(inside & (places.clearance_mm * scale >= options.clear_px))
     chosen = _spread_samples(chosen, places.dark, options.patches // 2)
@@ -159,14 +159,16 @@ def patches_of(
     )
 
 
-def on_board(
+def points_on_board(
     board: Board, places: Float[np.ndarray, "n 2"], bending_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Places seen from straight above, in the frame of the board, mm."""
     return bend_points(board, np.column_stack([places, -board.step_mm * board.terrace_at(places[:, 0])]), bending_mm)
 
 
-def _in_squares(board: Board, corner: Int[np.ndarray, "k"], places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+def _is_beside_corner(
+    board: Board, corner: Int[np.ndarray, "k"], places: Float[np.ndarray, "n 2"]
+) -> Bool[np.ndarray, "n"]:
     """Whether a place lies in one of the squares that meet in a corner that was seen: nothing hides these."""
     away, _ = cKDTree(board.corners[corner, :2]).query(places, p=np.inf)
     return np.asarray(away < board.square_mm)

@@ -22,7 +22,7 @@ from cuspid.calibration.patches import (
     Patches,
     PatchOptions,
     clear_places,
-    joined_patches,
+    join_patches,
     patches_of,
 )
 from cuspid.calibration.shading import (
@@ -100,7 +100,7 @@ class CameraLight:
     gain_sigma_pct: float
     """Standard deviation of the gain."""
     corner_loss_pct: float | None
-    """Light that is lost in the corners of the image; None where the images do not tell."""
+    """Light that is lost in the corners of the image; None where the images do not determine it."""
     corner_loss_sigma_pct: float | None
     """Standard deviation of the corner loss, in the same unit."""
     gamma: float
@@ -173,14 +173,14 @@ def calibrate_light(
 ) -> Photometry:
     """Gain, falloff, gamma and noise of each camera that saw enough; with a drawn handpiece, in whose frame the rig is,
     also the positions and powers of its lights."""
-    looked_at = {name: _of_camera(patches, name) for name in found.rig.names}
+    looked_at = {name: _camera_patches(patches, name) for name in found.rig.names}
     sound = {key: each.take(each.usable) for key, each in patches.items()}
-    counts = {name: len(_of_camera(sound, name).level_dn) for name in found.rig.names}
+    counts = {name: len(_camera_patches(sound, name).level_dn) for name in found.rig.names}
     names = [name for name, count in counts.items() if count >= _LEAST_PATCHES]
-    notes = list(_unseen(counts, looked_at))
+    notes = list(_patch_notes(counts, looked_at))
     if not names:
-        return _nothing(drawn, notes)
-    noise = {name: noise_of(_of_camera(sound, name)) for name in names}
+        return _empty_photometry(drawn, notes)
+    noise = {name: noise_of(_camera_patches(sound, name)) for name in names}
     seen = {key: each for key, each in sound.items() if key[0] in names and len(each.level_dn)}
     case = _Case(found, seen, board, names, noise, drawn, options)
     fit = case.adjust()
@@ -195,7 +195,7 @@ def calibrate_light(
     return _describe(case, fit, {name: _share(~each.usable) for name, each in looked_at.items()}, notes)
 
 
-def _nothing(drawn: Handpiece | None, notes: Sequence[str]) -> Photometry:
+def _empty_photometry(drawn: Handpiece | None, notes: Sequence[str]) -> Photometry:
     return Photometry(
         sensors={},
         lights={} if drawn is None else drawn.lights,
@@ -208,15 +208,15 @@ def _nothing(drawn: Handpiece | None, notes: Sequence[str]) -> Photometry:
     )
 
 
-def _of_camera(patches: ViewPatches, name: str) -> Patches:
-    return joined_patches([each for (camera, _), each in patches.items() if camera == name])
+def _camera_patches(patches: ViewPatches, name: str) -> Patches:
+    return join_patches([each for (camera, _), each in patches.items() if camera == name])
 
 
 def _share(chosen: Bool[np.ndarray, "n"]) -> float:
     return float(chosen.mean()) if len(chosen) else 0.0
 
 
-def _unseen(counts: Mapping[str, int], looked_at: Mapping[str, Patches]) -> Iterator[str]:
+def _patch_notes(counts: Mapping[str, int], looked_at: Mapping[str, Patches]) -> Iterator[str]:
     for name, count in counts.items():
         paper = looked_at[name].take(~looked_at[name].dark)
         burnt = _share(paper.level_dn >= BRIGHTEST_DN)
@@ -288,7 +288,7 @@ class _Case:
         """The patches of some instants as arrays."""
         keys = [(name, instant) for instant in instants for name in self.names if (name, instant) in self.patches]
         parts = [self.patches[key] for key in keys]
-        every, counts = joined_patches(parts), [len(each.level_dn) for each in parts]
+        every, counts = join_patches(parts), [len(each.level_dn) for each in parts]
         at = np.repeat([instants.index(instant) for _, instant in keys], counts)
         camera = np.repeat([self.names.index(name) for name, _ in keys], counts)
         poses = [self.found.rig_from_view[key] for key in keys]
@@ -344,14 +344,14 @@ class _Case:
 
 def _describe(case: _Case, fit: Shading, clipped: Mapping[str, float], notes: list[str]) -> Photometry:
     halves = case.halves()
-    apart = _apart(halves, len(case.names)) if halves else None
+    apart = _difference_in_sigmas(halves, len(case.names)) if halves else None
     fit = replace(fit, covariance=fit.covariance * max(1.0, apart or 0.0) ** 2)
     sensors = {name: _sensor(case, fit, index) for index, name in enumerate(case.names)}
     lamps = {name: _lamp(case, fit, k, light) for k, (name, light) in enumerate(case.lamps.items())}
     residuals = _residuals(case, fit)
-    held_out = _held_out(case, halves)
+    held_out = _held_out_residuals(case, halves)
     return Photometry(
-        sensors={name: _as_told(sensor, case.sensor(name)) for name, sensor in sensors.items()},
+        sensors={name: _keep_unobservable_falloff(sensor, case.sensor(name)) for name, sensor in sensors.items()},
         lights=lamps or dict(case.drawn.lights if case.drawn else {}),
         cameras={
             name: CameraLight(
@@ -368,7 +368,7 @@ def _describe(case: _Case, fit: Shading, clipped: Mapping[str, float], notes: li
         halves_apart=apart,
         noise=case.noise,
         residuals_pct=residuals,
-        notes=(*notes, *_doubts(case, fit, sensors), *_untold(case, lamps)),
+        notes=(*notes, *_doubt_notes(case, fit, sensors), *_unobservable_notes(case, lamps)),
     )
 
 
@@ -389,18 +389,18 @@ def _corner_sigma(sensor: Sensor) -> float:
     return (1 - sensor.corner_loss) * float(np.sqrt(require_covariance(sensor.covariance)[1:3, 1:3].sum()))
 
 
-def _as_told(sensor: Sensor, given: Sensor) -> Sensor:
+def _keep_unobservable_falloff(sensor: Sensor, given: Sensor) -> Sensor:
     """With the falloff that was given where the images tell none."""
     return sensor if _corner_sigma(sensor) <= _NO_CORNER else replace(sensor, falloff=given.falloff)
 
 
 def _numbers(sensor: Sensor, noise: Noise) -> dict[str, float | None]:
-    covariance, told = require_covariance(sensor.covariance), _corner_sigma(sensor) <= _NO_CORNER
+    covariance, falloff_known = require_covariance(sensor.covariance), _corner_sigma(sensor) <= _NO_CORNER
     return {
         "gain": sensor.gain,
         "gain_sigma_pct": 100 * float(np.sqrt(covariance[0, 0])),
-        "corner_loss_pct": 100 * sensor.corner_loss if told else None,
-        "corner_loss_sigma_pct": 100 * _corner_sigma(sensor) if told else None,
+        "corner_loss_pct": 100 * sensor.corner_loss if falloff_known else None,
+        "corner_loss_sigma_pct": 100 * _corner_sigma(sensor) if falloff_known else None,
         "gamma": sensor.gamma,
         "gamma_sigma_pct": 100 * float(np.sqrt(covariance[3, 3])),
         "noise_dn": noise.noise_dn,
@@ -434,7 +434,7 @@ def _lamp(case: _Case, fit: Shading, index: int, drawn: Light) -> Light:
     )
 
 
-def _held_out(case: _Case, halves: Sequence[tuple[Samples, Shading]]) -> dict[str, Float[np.ndarray, "n"]]:
+def _held_out_residuals(case: _Case, halves: Sequence[tuple[Samples, Shading]]) -> dict[str, Float[np.ndarray, "n"]]:
     """Residuals of each half under what the other one tells."""
     left: dict[str, list[Float[np.ndarray, "n"]]] = {name: [] for name in case.names}
     for (samples, _), (_, other) in zip(halves, halves[::-1], strict=True):
@@ -444,14 +444,14 @@ def _held_out(case: _Case, halves: Sequence[tuple[Samples, Shading]]) -> dict[st
     return {name: np.concatenate(each) if each else np.zeros(0) for name, each in left.items()}
 
 
-def _apart(halves: Sequence[tuple[Samples, Shading]], cameras: int) -> float:
+def _difference_in_sigmas(halves: Sequence[tuple[Samples, Shading]], cameras: int) -> float:
     """RMS over the numbers of the cameras, each in its standard deviations."""
     size = PER_CAMERA * cameras
     (_, one), (_, other) = halves
     difference = (one.unknowns - other.unknowns)[:size]
     variance = np.diag(one.covariance + other.covariance)[:size]
-    told = variance > 0
-    return float(np.sqrt(np.mean(difference[told] ** 2 / variance[told])))
+    determined = variance > 0
+    return float(np.sqrt(np.mean(difference[determined] ** 2 / variance[determined])))
 
 
 def _rms(residuals: Float[np.ndarray, "n"]) -> float:
@@ -460,7 +460,7 @@ def _rms(residuals: Float[np.ndarray, "n"]) -> float:
     return float(np.sqrt(np.mean(usual**2))) if len(usual) else 0.0
 
 
-def _doubts(case: _Case, fit: Shading, sensors: Mapping[str, Sensor]) -> Iterator[str]:
+def _doubt_notes(case: _Case, fit: Shading, sensors: Mapping[str, Sensor]) -> Iterator[str]:
     """Where the search did not end, patches are not what the model says, or images leave something open."""
     if not fit.settled:
         yield "the adjustment of light did not converge; its results may be wrong"
@@ -485,18 +485,18 @@ def _doubts(case: _Case, fit: Shading, sensors: Mapping[str, Sensor]) -> Iterato
                 f"camera {name}: the falloff in its corners is {known_to}; show it the board in the corners too, "
                 "together with other cameras"
             )
-    if _gamma_told(case, fit) > _TOLD:
+    if _gamma_sigma_ratio(case, fit) > _TOLD:
         yield "gamma cannot be determined from these images; it stays close to the given value"
 
 
-def _gamma_told(case: _Case, fit: Shading) -> float:
+def _gamma_sigma_ratio(case: _Case, fit: Shading) -> float:
     """Standard deviation of what all cameras have in common of gamma, as a share of what it was before."""
     count = len(case.names)
     own = slice(3 * count, 4 * count)
     return float(np.sqrt(fit.covariance[own, own].mean()) / max(case.options.gamma_pct / 100, 1e-4))
 
 
-def _untold(case: _Case, lamps: Mapping[str, Light]) -> Iterator[str]:
+def _unobservable_notes(case: _Case, lamps: Mapping[str, Light]) -> Iterator[str]:
     """Lamps whose places the images do not tell; and what they never tell."""
     if not lamps:
         return

@@ -1,10 +1,10 @@
 """Covariances from how much the views disagree, not only from how much the corners within a view scatter.
 
 The errors of the corners in a view have causes in common: blur, light, how the board is bent, what the lens model
-lacks. Corners that err together tell less than as many that err apart. So each instant is taken as a whole: what it
-alone would move the result by, summed as squares over the instants, is a covariance that needs no model of what is
-common within one (H. White, Econometrica 48, 1980; clusters: K.-Y. Liang, S. Zeger, Biometrika 73, 1986). It is made
-free of bias where the corners do err apart (CR2: R. Bell, D. McCaffrey, Survey Methodology 28, 2002).
+lacks. Corners with a common error carry less information than as many with independent errors. So each instant is taken
+as a whole: what it alone would move the result by, summed as squares over the instants, is a covariance that needs no
+model of what is common within one (H. White, Econometrica 48, 1980; clusters: K.-Y. Liang, S. Zeger, Biometrika 73,
+1986). It is made free of bias where the corners do err apart (CR2: R. Bell, D. McCaffrey, Survey Methodology 28, 2002).
 
 Few instants make such a covariance erratic, and that of a dozen parameters from fewer instants singular. It is
 therefore shrunk towards a multiple of the one that the scatter of the corners gives (as O. Ledoit, M. Wolf, J.
@@ -32,7 +32,7 @@ def influences(
     """The unknowns that are common to all instants, and by how much each instant moves them.
 
     Args:
-        matrix: Of the normal equations, with what the prior tells.
+        matrix: Of the normal equations, prior included.
         instants: Of each, derivatives of the projections by all unknowns, and residuals, in standard deviations.
         own: Unknowns that belong to single instants, such as the poses of the board.
     """

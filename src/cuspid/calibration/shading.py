@@ -226,7 +226,7 @@ def adjust_shading(
 ) -> Shading:
     """The unknowns that best explain the brightness of the patches (Gauss-Newton on the Huber loss).
 
-    Values in ``held`` are held fixed (NaN where they are free). How far the light at an instant deviates from that of
+    Values in ``held`` are kept fixed (NaN where they are free). How far the light at an instant deviates from that of
     the lamps is estimated, unless it is given; if no lamps are known, it is unconstrained.
     """
     start = np.zeros(len(given.precision)) if held is None else np.nan_to_num(held)
@@ -318,6 +318,8 @@ def _degree_sigmas(
     """Standard deviations of the terms of each degree: the squares of the terms over how many of them the images tell
     (a step of MacKay's)."""
     squares, degrees = (extra**2).mean(axis=0), _degrees(extra.shape[1])
-    told = 1 - variance.mean(axis=0) / before[degrees] ** 2
-    found = [squares[degrees == d].mean() / max(told[degrees == d].mean(), _DIMMEST) for d in range(degrees[-1] + 1)]
+    information = 1 - variance.mean(axis=0) / before[degrees] ** 2
+    found = [
+        squares[degrees == d].mean() / max(information[degrees == d].mean(), _DIMMEST) for d in range(degrees[-1] + 1)
+    ]
     return np.asarray(np.clip(np.sqrt(found), _STEADIEST, _UNKNOWN))

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.calibration.agreement import agreed_on, apart, disagreement_between
-from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, in_front, of_instants
+from cuspid.calibration.agreement import consensus_motion, disagreement_between, motion_difference
+from cuspid.calibration.bundle import Adjusted, BoardScene, adjust_board, select_instants, views_in_front
 from cuspid.calibration.corners import LEAST_CORNERS, BoardView, Views, pieces
 from cuspid.geometry import Rigid3, best_similarity
 from cuspid.geometry.graph import parts_of
@@ -34,7 +34,7 @@ _NO_FIT_SHARE = 0.01
 """Residuals of a single camera, as a share of its image width, beyond which no camera model fits."""
 
 
-def calibrated_alone(
+def calibrate_single_camera(
     views: Sequence[BoardView], board: Target, size: tuple[int, int], starts: Sequence[Camera] = ()
 ) -> Adjusted:
     """One camera from its own views; the poses of the board relative to other cameras play no part.
@@ -42,7 +42,7 @@ def calibrated_alone(
     The search begins from each of some cameras (whose model the result has, the best of them), or from OpenCV's. Raises
     ReconstructionError where the views fit no camera, or do not determine its focal length.
     """
-    found = [each for each in (_calibrated_from(start, views, board, size) for start in starts or (None,)) if each]
+    found = [each for each in (_calibrate_from(start, views, board, size) for start in starts or (None,)) if each]
     if not found:
         raise ReconstructionError("no camera model fits its views of the board")
     best = min(found, key=lambda each: each.sigma_px)
@@ -51,7 +51,7 @@ def calibrated_alone(
     return best
 
 
-def _calibrated_from(
+def _calibrate_from(
     camera: Camera | None, views: Sequence[BoardView], board: Target, size: tuple[int, int]
 ) -> Adjusted | None:
     """None where the views do not fit."""
@@ -65,10 +65,10 @@ def _calibrated_from(
             rig_from_board=named,
             bending_mm=np.zeros(3 * len(board.boards)),
         )
-        sound = in_front(start, {("", str(k)): view for k, view in enumerate(views)}, board)
+        sound = views_in_front(start, {("", str(k)): view for k, view in enumerate(views)}, board)
         if len(sound) < LEAST_VIEWS:
             return None
-        return adjust_board(of_instants(start, {instant for _, instant in sound}), sound, board)
+        return adjust_board(select_instants(start, {instant for _, instant in sound}), sound, board)
     except (cv2.error, InputError):  # such as a focal length that is no number
         return None
 
@@ -134,7 +134,7 @@ def join_cameras(
         rig_from_board[instant] = cam_from_rig[first].inverse() @ poses[first, instant][0]
         for name in seeing:
             expected = cam_from_rig[name] @ rig_from_board[instant]
-            best = min(range(len(board.orders)), key=lambda k: apart(poses[name, instant][k], expected)[0])
+            best = min(range(len(board.orders)), key=lambda k: motion_difference(poses[name, instant][k], expected)[0])
             chosen[name, instant] = numbered[name, instant][best]
     scene = BoardScene(
         cameras=cameras,
@@ -183,7 +183,7 @@ def _rms_of(residuals: Sequence[Float[np.ndarray, "n 2"]]) -> float:
 
 
 Poses = Mapping[tuple[str, str], Sequence[Rigid3]]
-"""By camera and instant, ``cam_from_board`` under each numbering of the corners."""
+"""``cam_from_board`` under each numbering of the corners, by camera and instant."""
 
 
 def groups(views: Collection[tuple[str, str]], cameras: Sequence[str]) -> list[list[str]]:
@@ -222,9 +222,9 @@ def _average_relative_pose(poses: Poses, known: str, new: str, instants: Sequenc
 
     Raises ReconstructionError where less than half of them do.
     """
-    said = [[pose @ poses[known, instant][0].inverse() for pose in poses[new, instant]] for instant in instants]
+    candidates = [[pose @ poses[known, instant][0].inverse() for pose in poses[new, instant]] for instant in instants]
     distance_mm = float(np.median([np.linalg.norm(poses[new, instant][0].translation) for instant in instants]))
-    best, agreeing, _ = agreed_on(said, distance_mm)
+    best, agreeing, _ = consensus_motion(candidates, distance_mm)
     if 2 * agreeing < len(instants):
         own = _poses_of(poses, new), _poses_of(poses, known)
         raise ReconstructionError(disagreement_between((new, known), own, agreeing, len(instants), distance_mm))

@@ -61,7 +61,7 @@ def find_tag_corners(
     found = {tag: each for tag, outline in outlines.items() if (each := _refine_tag(image, outline)) is not None}
     new = found
     while new:
-        new = dict(_foretold(image, board, found, new))
+        new = dict(_find_predicted_tags(image, board, found, new))
         found |= new
     if not found:
         return None
@@ -130,7 +130,7 @@ def _refine_tag(image: UInt8[np.ndarray, "h w"], outline: Outline) -> Outline | 
     return found if (moved < max(2.0 * half, _REACH * side)).all() else None
 
 
-def _foretold(
+def _find_predicted_tags(
     image: UInt8[np.ndarray, "h w"], board: Board, found: dict[int, Outline], new: dict[int, Outline]
 ) -> Iterator[tuple[int, Outline]]:
     """Tags beside some new ones, by what has been found around them, if the image shows their bits there."""
@@ -147,10 +147,10 @@ def _foretold(
         homography, _ = cv2.findHomography(places[near], pixels[near])
         if homography is None:
             continue
-        there = cv2.perspectiveTransform(own[None], homography)[0]
-        if not _is_inside(there, image):
+        predicted = cv2.perspectiveTransform(own[None], homography)[0]
+        if not _is_inside(predicted, image):
             continue
-        exact = _refine_tag(image, there)
+        exact = _refine_tag(image, predicted)
         if exact is not None and _is_inside(exact, image) and _shows(image, exact, board.tag_bits(tag)):
             yield tag, exact
 
@@ -202,6 +202,6 @@ def _fits_neighbours(places: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray,
         if homography is None:
             off[k] = np.inf
             continue
-        there = cv2.perspectiveTransform(places[k].reshape(1, 1, 2), homography)
-        off[k] = np.linalg.norm(there - pixels[k])
+        predicted = cv2.perspectiveTransform(places[k].reshape(1, 1, 2), homography)
+        off[k] = np.linalg.norm(predicted - pixels[k])
     return np.asarray(off <= _OFF_USUAL * np.median(off) + _OFF_PX)

@@ -24,7 +24,7 @@ _ROUNDS = 10
 """Maximum number of times that instants are chosen anew."""
 
 
-def follow_each_other(frame: Mapping[str, int]) -> bool:
+def are_consecutive(frame: Mapping[str, int]) -> bool:
     """Whether most instants have one within reach, so that the path of the board can be followed."""
     numbers = sorted(frame.values())
     near = sum(after - before <= _REACH for before, after in pairwise(numbers))
@@ -37,7 +37,7 @@ def allow_delays(scene: BoardScene, frame: Mapping[str, int], views: Views) -> B
     return _choose_instants(scene, timing, scene.rig_from_board, views)
 
 
-def rolling(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
+def allow_rolling(scene: BoardScene, frame: Mapping[str, int], views: Views) -> BoardScene:
     """A scene whose cameras may expose their rows one after the other; as yet, all at once."""
     together = Timing(frame=frame, near={}, by_camera=dict.fromkeys(scene.cameras, 0.0), by_view={}, together=True)
     timing = replace(scene.timing or together, readout=dict.fromkeys(scene.cameras, 0.0))
@@ -84,10 +84,10 @@ def _nearest(timing: Timing, view: tuple[str, str], instants: Iterable[str]) -> 
 def _within_reach(order: Sequence[str], k: int, frame: Mapping[str, int], beside: int) -> tuple[str, ...]:
     """An instant, then so many before and after it, up to where one is too far from the next."""
     before, after = order[max(k - beside, 0) : k][::-1], order[k + 1 : k + 1 + beside]
-    return order[k], *_unbroken(order[k], before, frame), *_unbroken(order[k], after, frame)
+    return order[k], *_contiguous(order[k], before, frame), *_contiguous(order[k], after, frame)
 
 
-def _unbroken(first: str, others: Iterable[str], frame: Mapping[str, int]) -> Iterator[str]:
+def _contiguous(first: str, others: Iterable[str], frame: Mapping[str, int]) -> Iterator[str]:
     """Those of instants in order that follow each other, from a first one."""
     for each in others:
         if abs(frame[each] - frame[first]) > _REACH:

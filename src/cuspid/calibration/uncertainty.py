@@ -39,15 +39,15 @@ def projection_sigma_px(camera: Camera, columns: int = 32) -> Float[np.ndarray, 
     known = np.linalg.norm(camera.project(rays) - pixels, axis=1) < _BACK_PX
     covariance = np.zeros((numbers, numbers)) if camera.covariance is None else camera.covariance
     sigma = np.full(len(known), np.nan)
-    sigma[known] = _without_turn(lens.reshape(-1, 2, numbers)[known], turn.reshape(-1, 2, 3)[known], covariance)
+    sigma[known] = _sigma_without_turn(lens.reshape(-1, 2, numbers)[known], turn.reshape(-1, 2, 3)[known], covariance)
     return sigma.reshape(rows, columns)
 
 
 def lens_difference_px(
     camera: Camera, other: Camera, seen: Float[np.ndarray, "n 2"], columns: int = 32
 ) -> Float[np.ndarray, "r c 2"]:
-    """By how much another lens would move the projections of a camera of far points, px, on a grid of square cells over
-    the image; NaN where either has no inverse or shows nothing.
+    """How far another lens would move a camera's projections of distant points, px, on a grid of square cells over the
+    image; NaN where either has no inverse or shows nothing.
 
     The other camera is turned so that it agrees best where corners were seen: a turn is no difference between lenses.
     """
@@ -75,7 +75,7 @@ def _grid(camera: Camera, columns: int) -> tuple[Float[np.ndarray, "n 2"], int]:
     return np.stack([across, down], axis=-1).reshape(-1, 2), rows
 
 
-def _without_turn(
+def _sigma_without_turn(
     lens: Float[np.ndarray, "n 2 k"], turn: Float[np.ndarray, "n 2 3"], covariance: Float[np.ndarray, "k k"]
 ) -> Float[np.ndarray, "n"]:
     """Standard deviations, from derivatives of the projections by the intrinsics and by a turn, each place weighted by

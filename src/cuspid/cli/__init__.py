@@ -34,7 +34,7 @@ class _Commands(Mapping[str, Callable[..., Any]]):
     def __getitem__(self, verb: str) -> Callable[..., Any]:
         module, _, function, distribution = VERBS[verb]
         if distribution is not None:
-            return load_plugin("cuspid.verbs", verb, asked=verb, distribution=distribution)
+            return load_plugin("cuspid.verbs", verb, requested=verb, distribution=distribution)
         return getattr(import_module(f"cuspid.cli.{module}"), function or verb.split()[-1])
 
     def __iter__(self) -> Iterator[str]:
@@ -151,14 +151,14 @@ _IN_OTHER_LETTERS = "cuspid.in_other_letters"
 _LETTERS = {"µ": "u", "μ": "u", "±": "+-", "°": " deg", "²": "2", "³": "3", "×": "x", "…": "...", "—": "-", "–": "-"}
 
 
-def _in_other_letters(error: UnicodeError) -> tuple[str, int]:
+def _describe_system_error(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    wanted = error.object[error.start : error.end]
-    return "".join(_LETTERS.get(letter, "?") for letter in wanted), error.end
+    letters = error.object[error.start : error.end]
+    return "".join(_LETTERS.get(letter, "?") for letter in letters), error.end
 
 
-codecs.register_error(_IN_OTHER_LETTERS, _in_other_letters)
+codecs.register_error(_IN_OTHER_LETTERS, _describe_system_error)
 
 
 def _run_verb(verb: str, given: list[str]) -> None:

@@ -99,7 +99,7 @@ def _arguments(verb: str, options: Mapping[str, Option], file: Path) -> list[str
     try:
         table = tomllib.loads(read_text(file))
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{file}: it is no TOML ({one_line(error)})") from error
+        raise InputError(f"{file}: not valid TOML ({one_line(error)})") from error
     arguments: list[str] = []
     for name, value in _leaves(table):
         if name not in options:
@@ -108,7 +108,7 @@ def _arguments(verb: str, options: Mapping[str, Option], file: Path) -> list[str
             raise InputError(f"{file}: {verb} has no option {one_line(name)}{meant}")
         if not _is_taken(value, options[name].hint):
             raise InputError(
-                f"{file}: {name} is {quote(value)}, which it cannot be; cuspid {verb} --help-all lists its options"
+                f"{file}: {name} is {quote(value)}, which is not allowed; cuspid {verb} --help-all lists its options"
             )
         arguments += _as_arguments(name, value, options[name].hint)
     return arguments

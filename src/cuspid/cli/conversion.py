@@ -17,7 +17,7 @@ from cuspid.storage.calibrations import (
     MOST_LOST_PX,
     Loss,
     Name,
-    carried_over,
+    fit_to_format,
     format_of_name,
     read_calibration,
     write_calibration,
@@ -42,10 +42,10 @@ def convert(
         target: File to write: handpiece.json and other .json, rig_config.json, transforms.json, stereoParams.json,
             camchain.yaml (Kalibr), other .yml, .yaml (OpenCV), camera_array.toml (caliscope), other .toml (anipose),
             .xml (Metashape); or a folder, for two cameras of ROS.
-        from_: What the file is, where its content does not tell.
-        to: What is written, where the name does not tell.
-        unit: Unit of the lengths that are read, where the file does not tell it.
-        image_size: Width and height of the images, px, where the file does not tell them.
+        from_: Format of the file, where its content does not show it.
+        to: Format to write, where the name does not show it.
+        unit: Unit of the lengths that are read, where the file does not state it.
+        image_size: Width and height of the images, px, where the file does not state them.
         working_distance_mm: Distance from the cameras to the surface, for a handpiece.json (guessed unless given).
         max_px: A lens that the other format does not have is replaced by the nearest that it has; more than this
             difference in the image is refused.
@@ -55,12 +55,12 @@ def convert(
         raise InputError(f"convert: {target}: is the file that is read; give another name for the result")
     read = read_calibration(source, kind=from_, unit=unit, image_size_px=image_size)
     _tell(source, read.losses, read.notes, max_px)
-    carried = carried_over(read.rig, kind)
+    carried = fit_to_format(read.rig, kind)
     _tell(target, carried.losses, carried.notes, max_px)
     write_calibration(target, carried.rig, kind, working_distance_mm)
     names = list(read.rig.names)
-    said = f"{target}: {kind}, {len(names)} camera(s) ({join_names(names)}), from {read.format}"
-    console.print(said, soft_wrap=True, highlight=False)
+    summary = f"{target}: {kind}, {len(names)} camera(s) ({join_names(names)}), from {read.format}"
+    console.print(summary, soft_wrap=True, highlight=False)
 
 
 def _tell(path: Path, losses: Mapping[str, Loss], notes: tuple[str, ...], max_px: float) -> None:

@@ -92,7 +92,7 @@ def _figures(plan: Plan, films: Films, looks: Mapping[str, Looks], options: Impo
     return {
         "sync": options.sync.sync,
         "starts_frames": plan.starts_frames,
-        "apart_ms": None if plan.apart_ms is None else {"median": _median(plan.apart_ms), "max": _most(plan.apart_ms)},
+        "apart_ms": None if plan.apart_ms is None else {"median": _median(plan.apart_ms), "max": _max(plan.apart_ms)},
         "frames": len(plan.frames),
         "cameras": {
             name: {
@@ -116,7 +116,7 @@ def _median(values: np.ndarray) -> float:
     return round(float(np.nanmedian(values)), 3)
 
 
-def _most(values: np.ndarray) -> float:
+def _max(values: np.ndarray) -> float:
     return round(float(np.nanmax(values)), 3)
 
 
@@ -132,7 +132,7 @@ def _print(plan: Plan, looks: Mapping[str, Looks], out: Path) -> None:
         table.add_row(name, f"{len(each.level_dn)} frames", began, str(used), "; ".join(_drop_notes(plan, name)) or "-")
     console.print(table)
     if plan.apart_ms is not None:
-        apart = f"{_median(plan.apart_ms):.1f} ms apart at the median, {_most(plan.apart_ms):.1f} at most"
+        apart = f"{_median(plan.apart_ms):.1f} ms apart at the median, {_max(plan.apart_ms):.1f} at most"
         console.print(f"according to their times, the images of a frame are {apart}")
     console.print(f"{out}: {len(plan.frames)} frames of {len(looks)} cameras")
 

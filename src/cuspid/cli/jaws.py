@@ -136,7 +136,7 @@ def _write_jaw(path: Path, make: Callable[[], Jaw], title: str) -> Jaw:
     if path.suffix.lower() not in storage.MESH_SUFFIXES:
         raise InputError(f"{path}: give a file name that ends in .ply, .stl, .obj or .off")
     if path.exists() and not (path.is_file() and storage.is_jaw(path)):
-        raise OutputError(f"{path}: is there already, and no jaw that cuspid wrote; give another name as --out")
+        raise OutputError(f"{path}: exists already, and was not written by cuspid; give another name as --out")
     jaw = make()
     storage.write_jaw(path, jaw)
     save_picture(path.with_suffix(".png"), jaw.mesh, title=title)

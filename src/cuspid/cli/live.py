@@ -34,7 +34,7 @@ class FollowOptions(Options):
     watch: bool = False
     """Follow a folder into which images are still being written, instead of replaying a capture."""
     pace: Annotated[float | None, Range(0.001, 1000)] = None
-    """Frames a second of a replay; default: at the times that the capture tells, without these as fast as possible."""
+    """Frames a second of a replay; default: at the times stored in the capture, without these as fast as possible."""
     late_s: Annotated[float, Range(0, 3600)] = 2.0
     """A watched frame whose images are not all there is taken without them this long after the first image of a later
     one."""
@@ -135,11 +135,11 @@ def _watch_folder(folder: Path, handpiece: Path | None, distance_mm: float | Non
         assert arrivals.source is not None  # a frame has come
         return arrivals.source
 
-    frames = _arriving(arrivals, options)
+    frames = _await_frames(arrivals, options)
     return _Feed(handpiece=known, source=source, frames=frames, left_out=lambda: arrivals.left_out)
 
 
-def _arriving(arrivals: Arrivals, options: FollowOptions) -> Iterator[Frame | None]:
+def _await_frames(arrivals: Arrivals, options: FollowOptions) -> Iterator[Frame | None]:
     """Frames as they come; ends when none has come for long."""
     latest, paused = time.monotonic(), False
     while time.monotonic() - latest < options.end_s:
@@ -167,15 +167,15 @@ def _follow_feed(feed: _Feed, out: Path, options: ReconstructionOptions, view: G
             if view is not None and session is not None:
                 view.show(session, changed, words.lost)
     except KeyboardInterrupt:
-        console.print("the scan is ended; what came in is reconstructed")
+        console.print("scan ended; reconstructing what came in")
     except CuspidError as error:
         if session is None or not session.rig_from_world:
             raise
-        console.print(f"note: {error}; the scan is ended, and what came in is reconstructed", soft_wrap=True)
+        console.print(f"note: {error}; scan ended; reconstructing what came in", soft_wrap=True)
     left_out = feed.left_out()
     if session is None or not session.frames:
         why = next((f" ({each.what}: {each.reason})" for each in left_out), "")
-        raise InputError(f"no frame has come that can be used{why}; look whether images appear, and in which folder")
+        raise InputError(f"no usable frame has arrived{why}; check whether images appear, and in which folder")
     seconds = time.monotonic() - begin
     console.print(
         f"{len(session.rig_from_world)} of {len(session.frames)} frames placed as they came, "

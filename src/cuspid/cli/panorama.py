@@ -17,7 +17,7 @@ from cuspid.geometry import Rigid3
 from cuspid.model.facing import facing_outwards
 from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.panorama import FrameUse, Panorama
-from cuspid.motion.monocular.single import loosely_held
+from cuspid.motion.monocular.single import weak_stretches
 from cuspid.pipeline import panorama as panorama_pipeline
 from cuspid.pipeline.panorama import MeshViewOptions, StitchOptions
 from cuspid.report.figures.panorama import save_camera_path
@@ -156,8 +156,8 @@ def _write(folder: Path, part: Stitched) -> None:
 
 
 def save_path_picture(folder: Path, panorama: Panorama, cam_from_world: Mapping[str, Rigid3]) -> None:
-    """camera_path.png, with the frames that are held loosely."""
-    loose = {frame.name for stretch in loosely_held(panorama.frames) for frame in stretch}
+    """camera_path.png, with weakly constrained frames marked."""
+    loose = {frame.name for stretch in weak_stretches(panorama.frames) for frame in stretch}
     save_camera_path(folder / "camera_path.png", panorama, cam_from_world, loose)
 
 
@@ -173,11 +173,11 @@ def _print(parts: tuple[Stitched, ...], folders: list[Path]) -> None:
     whole = parts[0].panorama
     for note in whole.notes:
         console.print(f"note: {note}")
-    for line in left_out(whole.frames):
+    for line in left_out_reasons(whole.frames):
         console.print(f"  left out {line}")
 
 
-def left_out(frames: Iterable[FrameUse]) -> list[str]:
+def left_out_reasons(frames: Iterable[FrameUse]) -> list[str]:
     """The frames that are in no part, one line for each reason."""
     names: dict[str, list[str]] = {}
     for frame in frames:

@@ -1,4 +1,4 @@
-"""From photographs of one camera to a mesh: the part of ``cuspid reconstruct`` that has no handpiece."""
+"""Reconstructs a mesh from photographs of one camera: the part of ``cuspid reconstruct`` that has no handpiece."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def reconstruct_photographs(
     scale: PhotoScaleOptions,
     model: Path | None = None,
 ) -> None:
-    """Reconstruct, and tell how it went. ``model``: a COLMAP model, whose poses are taken."""
+    """Reconstruct and print a summary. ``model``: a COLMAP model, whose poses are taken."""
     settings = {"reconstruction": options, "photographs": photographs, "scale": scale, "from_poses": model}
     with show_progress() as progress:
         given = _read_photographs(source, out, handpiece, progress)
@@ -69,7 +69,7 @@ def _print(located: LocatedPhotographs, given: Photographs) -> None:
         console.print(f"note: {note}")
     if scale is None:
         console.print(
-            "note: nothing tells the scale: the result has none, and its lengths are not millimetres; give --square-mm "
+            "note: the scale is unknown: the result has none, and its lengths are not millimetres; give --square-mm "
             "for a board in the photographs, or a measured --distance --between two of them"
         )
         return

@@ -21,7 +21,7 @@ from cuspid.calibration.coverage import Coverage, CoverageOptions, coverage_cell
 from cuspid.cli.calibration import BoardFiles, target_of
 from cuspid.cli.shared import Flat, console
 from cuspid.footage.cameras import CameraSource, ExposureOptions, Ready
-from cuspid.footage.devices import FormatOptions, V4L2Camera, cameras_there
+from cuspid.footage.devices import FormatOptions, V4L2Camera, find_cameras
 from cuspid.footage.played import FilmCamera, RenderedCamera
 from cuspid.footage.quality import measure_quality, shrink_to_grey
 from cuspid.footage.record import Recording, RecordOptions, Status, Together, require_names
@@ -73,8 +73,8 @@ def record(
     copies: Annotated[int, Range(1, 50)] = 1,
     coverage: Annotated[CoverageOptions, Flat] = CoverageOptions(),
 ) -> None:
-    """Record several cameras at once, without loss, with their exposure held and a time for each image: footage for
-    cuspid import, or images of a board for cuspid calibrate.
+    """Record several cameras at once, without loss, with fixed exposure and a time for each image: footage for cuspid
+    import, or images of a board for cuspid calibrate.
 
     Args:
         cameras: The cameras, each as NAME=SOURCE or SOURCE: a device (/dev/video0, or its number), or a video or a
@@ -132,9 +132,9 @@ def _sources(
     return {name: camera for name, (_, camera) in found.items()}
 
 
-def _parse_camera(said: str) -> tuple[str, str]:
+def _parse_camera(text: str) -> tuple[str, str]:
     """Name and source of a camera."""
-    name, is_named, source = said.rpartition("=")
+    name, is_named, source = text.rpartition("=")
     source = f"/dev/video{source}" if source.isascii() and source.isdigit() else source
     return checked_name("record: --cameras", name if is_named else Path(source).stem), source
 
@@ -144,7 +144,7 @@ def _source(name: str, source: str, form: FormatOptions) -> CameraSource:
     if place.is_dir() or place.suffix.lower() in VIDEO_SUFFIXES:
         return FilmCamera(name, place, form.frames_per_s)
     if place.is_file():
-        raise InputError(f"{source}: is no camera, video or folder of images; give a device such as /dev/video0")
+        raise InputError(f"{source}: is not a camera, video or folder of images; give a device such as /dev/video0")
     return V4L2Camera(source, form)
 
 
@@ -166,7 +166,7 @@ def _simulate_cameras(handpiece: Path, form: FormatOptions, board: Target) -> di
 
 
 def _print_cameras() -> None:
-    found = cameras_there()
+    found = find_cameras()
     if not found:
         console.print("no camera is plugged in (there is no /dev/video* that delivers images)", soft_wrap=True)
         return

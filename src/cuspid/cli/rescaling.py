@@ -45,7 +45,7 @@ def rescale(
         out: Folder for the scaled panorama: the files of stitch, and distances.json and distances.png.
         distance: Two places of panorama.png, in px from its upper left corner, and how many mm lie between them. The
             page of the panorama gives the pixels of places that are clicked on. Of several (give it again), the scale
-            suits all as well as can be, and what each is off by is told.
+            is their least-squares fit, and the residual of each is printed.
     """
     if not distance:
         raise InputError("rescale: give at least one --distance U1 V1 U2 V2 MM")

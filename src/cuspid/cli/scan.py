@@ -103,7 +103,7 @@ def reconstruct(
     reconstruction: Annotated[ReconstructionOptions, Flat] = ReconstructionOptions(),
 ) -> None:
     """Reconstruct poses and a mesh: in millimetres from images and a handpiece file, or from photographs of one camera,
-    whose scale a board or a measured distance tells.
+    scaled by a board or a measured distance.
 
     Args:
         capture: Folder with images/<camera>/<frame>.png of a handpiece, folder of photographs, or video of one camera.
@@ -114,11 +114,10 @@ def reconstruct(
         from_poses: Folder of a COLMAP model whose poses are used instead of finding them.
     """
     if storage.is_photographs(capture, handpiece):
-        given = reconstruction, photographs, scale, from_poses
-        reconstruct_photographs(capture, out, handpiece, *given)
+        reconstruct_photographs(capture, out, handpiece, reconstruction, photographs, scale, from_poses)
         return
     if scale != PhotoScaleOptions():
-        raise InputError("--square-mm and --distance are for photographs of one camera; a handpiece knows the scale")
+        raise InputError("--square-mm and --distance are for photographs of one camera; a handpiece sets the scale")
     reconstruct_capture(storage.read_capture(capture, handpiece, working_distance_mm), out, reconstruction, from_poses)
 
 
@@ -135,7 +134,7 @@ def evaluate(
 
     Args:
         mesh: The scan (STL, PLY, OBJ, OFF), in any pose, in --unit.
-        reference: A mesh, or the folder truth/ of a simulation, which also tells what could be seen.
+        reference: A mesh, or the folder truth/ of a simulation, which also records what could be seen.
         out: Folder for the results.
         reference_unit: Length unit of the reference, if it is another one than that of the scan.
     """
@@ -159,7 +158,7 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
 
 
 def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None = None) -> None:
-    """Reconstruct, and tell how it went. ``model``: a COLMAP model, whose poses are taken."""
+    """Reconstruct and print a summary. ``model``: a COLMAP model, whose poses are taken."""
     settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs):
@@ -239,7 +238,7 @@ def _evaluate_trajectory(mesh: Path, truth: Path, trueness: Trueness, out: Path)
     found, true = mesh.parent / "motion" / "poses.json", truth / "poses.json"
     if mesh.stem != "mesh" or not (found.is_file() and true.is_file()):
         return
-    poses = _as_of(storage.read_poses(found), found.parent, truth)
+    poses = _in_true_frame(storage.read_poses(found), found.parent, truth)
     try:
         error = trajectory_error(poses, storage.read_poses(true), trueness.reference_from_scan)
     except InputError as reason:
@@ -253,7 +252,7 @@ def _evaluate_trajectory(mesh: Path, truth: Path, trueness: Trueness, out: Path)
     )
 
 
-def _as_of(rig_from_world: Mapping[str, Rigid3], motion: Path, truth: Path) -> dict[str, Rigid3]:
+def _in_true_frame(rig_from_world: Mapping[str, Rigid3], motion: Path, truth: Path) -> dict[str, Rigid3]:
     """Poses of the frame in which the true handpiece is described: where a calibration has its own, no image tells."""
     files = [folder / "handpiece.json" for folder in (motion, truth)]
     if not all(file.is_file() for file in files):

@@ -139,7 +139,7 @@ def _require_places(path: Path, device: Handpiece) -> None:
 
 
 def suit_lights(probe: Probe, texture: Preset) -> Probe:
-    """With the lights that suit the teeth, for a built-in design for which none are asked for."""
+    """A probe with the lights that suit the teeth, if it is a built-in design without explicit ones."""
     if probe.handpiece is not None or probe.lights is not None:
         return probe
     plain = texture in ("enamel", "natural")
@@ -149,16 +149,18 @@ def suit_lights(probe: Probe, texture: Preset) -> Probe:
 
 
 def print_expected(found: Reconstruction, sigma_um: Float[np.ndarray, "v"]) -> None:
-    """Tell how far a surface may be off; nothing where the poses do not tell it."""
+    """Tell how far a surface may be off; nothing where the poses do not determine it."""
     expected = found.expectation
     if expected is None:
         return
     middle, most = np.percentile(sigma_um, [50, 95])
     if expected.is_exact:
-        told = "the calibration, which states no uncertainty, and the poses are taken as exact"
+        assumptions = "the calibration, which states no uncertainty, and the poses are taken as exact"
     else:
-        told = (
+        assumptions = (
             f"by {found.told_by}, scale within {expected.scale_sigma_ppm:.0f} ppm and the {expected.span_mm:.0f} mm "
             f"from end to end within {expected.span_sigma_um:.1f} µm"
         )
-    console.print(f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); {told}")
+    console.print(
+        f"expected (one sigma): surface within {middle:.1f} µm (median; {most:.1f} for 95 % of it); {assumptions}"
+    )

@@ -45,8 +45,8 @@ def sweep(
     """Find the best baseline and angle of a camera pair for one surface of a tooth, by scanning with each setting.
 
     Each setting is a complete scan: rendered, reconstructed and evaluated on that surface. The best ones are repeated
-    with other textures, hand motions and noise, to tell which are equally good. A killed sweep resumes with the same
-    command.
+    with other textures, hand motions and noise, to find out which are equally good. A killed sweep resumes with the
+    same command.
 
     Args:
         jaw: Mesh of a jaw with tooth labels; default: the built-in phantom.

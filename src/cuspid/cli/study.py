@@ -27,7 +27,7 @@ from cuspid.studies.grid import check_workers
 from cuspid.studies.scanners.files import Remark
 from cuspid.studies.scanners.scan import StudyOptions
 from cuspid.studies.scanners.statistics import summary as summarised
-from cuspid.studies.scanners.study import Intake, Prepared, Study, compare, foreseen, prepare
+from cuspid.studies.scanners.study import Intake, Prepared, Study, compare, plan_comparison, prepare
 from cuspid.studies.scanners.text import ANCHORS, checklist, methods
 from cuspid.studies.scanners.views import write_views
 
@@ -40,7 +40,8 @@ class References(Options):
     """How the reference meshes are read."""
 
     unit: storage.Unit | None = None
-    """Length unit of the references; told by their size unless given. That of each scan is told by its reference."""
+    """Length unit of the references; inferred from their size unless given. That of each scan is inferred from its
+    reference."""
     arch: Arch | None = None
     """Which jaw they show, if their teeth are to be numbered."""
     labels: Numbering = "auto"
@@ -76,7 +77,7 @@ def study(
     Args:
         folder: The folder, or the CSV table.
         out: Folder for report.html, figures/ (PNG at 300 dpi, PDF), tables/ (CSV) and tables.xlsx, study.json.
-        plan_um: A difference of mean deviations that the next study should see: its sample size is told.
+        plan_um: A difference of mean deviations that the next study should see: its sample size is printed.
         dry_run: List what would be compared and what is odd (duplicates, other units, mirrored or partial scans, other
             jaws), after a first alignment, which the study uses again.
         workers: Processes on this machine, one core each (default: one for each core).
@@ -101,7 +102,7 @@ def study(
             )
             found = None if dry_run else compare(prepared, out, options, progress)
         if found is None:
-            _print_remarks(foreseen(prepared, out, options))
+            _print_remarks(plan_comparison(prepared, out, options))
             _print_plan(prepared)
             return
         save_study(out, found, options, plan_um)
@@ -123,7 +124,7 @@ def save_study(out: Path, found: Study, options: StudyOptions, plan_um: float | 
         if rows:
             storage.write_table(out / "tables" / f"{name}.csv", rows, digits=4)
     storage.write_workbook(out / "tables.xlsx", {name: rows for name, rows in tables.items() if rows})
-    told = {
+    record = {
         **summarised(found.tables, seed=options.seed, plan_um=plan_um),
         "groups": found.tables.groups,
         "remarks": [asdict(each) for each in found.remarks],
@@ -131,13 +132,13 @@ def save_study(out: Path, found: Study, options: StudyOptions, plan_um: float | 
         "anchors": ANCHORS,
         "counts": counts(found),
     }
-    told |= {"methods": methods(options, told), "checklist": checklist(options, told)}
+    record |= {"methods": methods(options, record), "checklist": checklist(options, record)}
     write_views(out, found)
-    storage.write_json(out / "study.json", told)
+    storage.write_json(out / "study.json", record)
     views = storage.read_result(out)
     if isinstance(views, storage.ScannerStudyResult):
-        save_study_figures(out / "figures", found.tables.scans, found.tables.spans, told["agreements"], views.views)
-    _print(told)
+        save_study_figures(out / "figures", found.tables.scans, found.tables.spans, record["agreements"], views.views)
+    _print(record)
 
 
 def asdict_of(found: Study) -> dict[str, Any]:
@@ -184,15 +185,15 @@ def _print_plan(prepared: Prepared) -> None:
         table.add_column(column, justify="left" if column in ("scanner", "specimen", "unit") else "right")
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for scan in prepared.scans:
-        groups.setdefault((scan.scanner, scan.specimen), []).append(prepared.told[scan.key])
-    for (scanner, specimen), told in groups.items():
-        faces = [each["faces"] for each in told]
-        overlap = [each["overlap"] for each in told]
+        groups.setdefault((scan.scanner, scan.specimen), []).append(prepared.records[scan.key])
+    for (scanner, specimen), records in groups.items():
+        faces = [each["faces"] for each in records]
+        overlap = [each["overlap"] for each in records]
         table.add_row(
             scanner,
             specimen,
-            str(len(told)),
-            ", ".join(sorted({each["unit"] for each in told})),
+            str(len(records)),
+            ", ".join(sorted({each["unit"] for each in records})),
             _range([f"{each:,}" for each in sorted(faces)]),
             _range([f"{each:.0%}" for each in sorted(overlap)]),
         )
@@ -203,12 +204,12 @@ def _range(ordered: Sequence[str]) -> str:
     return ordered[0] if ordered[0] == ordered[-1] else f"{ordered[0]} to {ordered[-1]}"
 
 
-def _print(told: Mapping[str, Any]) -> None:
+def _print(figures: Mapping[str, Any]) -> None:
     table = Table(title="Trueness and precision / µm, with 95 % intervals", title_justify="left")
     mean, signed_mean = METRICS["mean_abs_um"].heading, METRICS["signed_mean_um"].heading
     for column in ("scanner", "scans", f"trueness: {mean}", signed_mean, f"precision: {mean}", "s_r"):
         table.add_column(column, justify="left" if column == "scanner" else "right")
-    for name, found in told["scanners"].items():
+    for name, found in figures["scanners"].items():
         table.add_row(
             name,
             str(found["scans"]),

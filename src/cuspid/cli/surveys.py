@@ -67,7 +67,7 @@ def measure(
         raise InputError(
             f"{landmarks}: a single file of landmarks for {len(files)} jaws; put one beside each mesh instead"
         )
-    hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}
+    hashes = {path.name: storage.hash_file(path) for path in _require_different_names(files)}
     with (
         storage.claimed_folder(out, "measure", {"arch": arch, "labels": labels}, hashes, replace=True),
         show_progress() as progress,
@@ -87,7 +87,7 @@ def measure(
     _print_survey(found)
 
 
-def _of_different_names(files: Sequence[Path]) -> Sequence[Path]:
+def _require_different_names(files: Sequence[Path]) -> Sequence[Path]:
     """The files, whose results are named after them."""
     for one, other in pairwise(sorted(files, key=lambda path: path.stem)):
         if one.stem == other.stem:
@@ -157,7 +157,7 @@ def shape(
         label_map: JSON file of each label in the mesh files and its FDI number, for other numbers: {"1": 47, "2": 46}.
     """
     files, labelling = jaw_files(jaws), Labelling(numbering=labels, label_map=label_map)
-    hashes = {path.name: storage.hash_file(path) for path in _of_different_names(files)}
+    hashes = {path.name: storage.hash_file(path) for path in _require_different_names(files)}
     with storage.claimed_folder(out, "shape", {"shape": options}, hashes, replace=True), show_progress() as progress:
         samples = {path.stem: _load_jaw(path, unit, arch, labelling) for path in files}
         model = mean_shape(samples, options, progress=progress)

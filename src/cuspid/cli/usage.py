@@ -32,13 +32,14 @@ RARE = re.compile(
 _SHORT = """{summary}
 
 {prog} --help-all shows all options.
---config FILE.toml takes them from a file; --write-config FILE.toml writes them as one, and does no more."""
+--config FILE.toml takes them from a file; --write-config FILE.toml writes them to one and exits."""
 _KINDS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH", bool: "{True,False}"}
 
 
 def show_help(prog: str, command: Callable[..., None], given: Sequence[str] = (), *, every: bool) -> None:
     """Print the help of a verb, or of the kind that the arguments name, and exit."""
-    about = None if every else _SHORT.format(summary=_summary(command), prog=prog)
+    summary = re.split(r"\n\s*Args:", command.__doc__ or "")[0].strip()
+    about = None if every else _SHORT.format(summary=summary, prog=prog)
     words = [word for word in given if not word.startswith("-")]
     shown, registry = describe_command(command, every=every)
     tyro.cli(shown, prog=prog, description=about, args=[*words, "--help"], registry=registry)
@@ -121,8 +122,3 @@ def _kind(hint: Any) -> str | None:
     if get_origin(kinds[0]) is Literal:
         return f"{{{','.join(map(str, get_args(kinds[0])))}}}"
     return _KINDS.get(kinds[0])
-
-
-def _summary(command: Callable[..., None]) -> str:
-    """What a verb says of itself, without its arguments."""
-    return re.split(r"\n\s*Args:", command.__doc__ or "")[0].strip()

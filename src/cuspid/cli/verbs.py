@@ -126,7 +126,7 @@ def overview(only: str | None = None) -> str:
     return "\n\n".join(
         [
             f"cuspid {__version__}: passive intra-oral 3D scanning, from the handpiece to the trueness of a mesh",
-            "usage: cuspid VERB [OPTIONS]      cuspid VERB --help tells what a verb takes      cuspid --version",
+            "usage: cuspid VERB [OPTIONS]      cuspid VERB --help explains a verb      cuspid --version",
             *groups,
         ]
     )

@@ -19,7 +19,7 @@ from cuspid.geometry import Rigid3, best_similarity
 from cuspid.runtime.errors import InputError
 
 AlignmentKind = Literal["best-fit", "area", "crowns", "landmarks", "spheres", "bodies", "none"]
-"""By what a scan is laid on its reference."""
+"""What a scan is aligned by."""
 CONSEQUENCES: Mapping[AlignmentKind, str] = MappingProxyType(
     {
         "best-fit": "global best fit over what all scans of a specimen show: errors of the whole arch are spread over "

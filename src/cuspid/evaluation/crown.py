@@ -68,10 +68,10 @@ def open_faces(mesh: Mesh, tooth: Bool[np.ndarray, "f"], least_openness: float) 
     """The open faces of a tooth, for a mesh with +Z out of the gum."""
     middle = mesh.face_centres[tooth].mean(axis=0)
     near = np.linalg.norm(mesh.face_centres - middle, axis=1) < OPENNESS_REACH_MM
-    wanted = near & tooth
+    candidates = near & tooth
     is_open = np.zeros(len(near), dtype=bool)
-    is_open[wanted] = (
-        openness(mesh.submesh(near), mesh.face_centres[wanted], mesh.face_normals[wanted]) >= least_openness
+    is_open[candidates] = (
+        openness(mesh.submesh(near), mesh.face_centres[candidates], mesh.face_normals[candidates]) >= least_openness
     )
     return is_open
 
@@ -132,7 +132,7 @@ def _note(crown: OpenCrown, could_be_seen: bool, evaluated: list[int]) -> str:
     """What is evaluated, for people."""
     where = "could be seen by two cameras" if could_be_seen else "lies within 200 µm of the scan"
     named = f"{len(evaluated)} pieces" if crown.estimated else ", ".join(map(str, evaluated))
-    estimated = "; crowns were told from gum by their shape, which is an estimate" if crown.estimated else ""
+    estimated = "; crowns were separated from gum by their shape, which is an estimate" if crown.estimated else ""
     return (
         f"evaluated part of the open crown surface: {named}; the share of each that {where} is "
         f"at least three quarters of the best one's{estimated}"

@@ -2,7 +2,7 @@
 
 The arch is taken for a bent bar along its curve c(s), s from the middle, with the tangent t(s) and +Z out of the gum.
 Errors of stitching add up along it: cross-sections turn by an angle that grows with s, and what lies beyond is carried
-along (Euler and Bernoulli's kinematics of bars). With the middle held, a place x beside c(s) moves by
+along (Euler and Bernoulli's kinematics of bars). With the middle fixed, a place x beside c(s) moves by
 
     u(x) = integral_0^s theta x t ds' + theta(s) x (x - c(s)).
 
@@ -14,7 +14,7 @@ along (Euler and Bernoulli's kinematics of bars). With the middle held, a place 
 - *scale*: u = e (x - c(0)), in all directions.
 
 Amplitudes of the first three are in um at the ends of the curve: the root mean square of how far the two ends move
-while the middle is held. All are fitted together with a rigid motion, by Gauss-Newton on exact closest-point distances
+while the middle is fixed. All are fitted together with a rigid motion, by Gauss-Newton on exact closest-point distances
 with Tukey's weights; the reference is bent until it lies on the scan.
 """
 
@@ -99,7 +99,7 @@ def straighten(
 
 def fit_deformation(places: Places, curve: ArchCurve, scan: SignedDistance) -> Deformation | None:
     """The modes of an aligned scan, fitted to places that it shows; None where these are too few, or beside less than
-    half of the arch, of which they would tell by extrapolation.
+    half of the arch, which they would describe by extrapolation.
 
     ``curve`` and ``places`` are those of the reference, in its occlusal frame.
     """
@@ -119,12 +119,12 @@ def fit_deformation(places: Places, curve: ArchCurve, scan: SignedDistance) -> D
     amplitudes = 1e3 * solution[6:]
     normal_rigid = np.einsum("nmk,nk->nm", rigid, used.normals)
     alone = {
-        name: amplitude * _without(normal_rigid, np.sum(1e3 * fields[name] * used.normals, axis=1))
+        name: amplitude * _residual(normal_rigid, np.sum(1e3 * fields[name] * used.normals, axis=1))
         for name, amplitude in zip(MODES, amplitudes, strict=True)
     }
     return Deformation(
         amplitudes=dict(zip(MODES, map(float, amplitudes), strict=True)),
-        rms_um={name: _rms(each) for name, each in alone.items()},
+        rms_um={name: float(np.sqrt(np.mean(each**2))) for name, each in alone.items()},
         before_um=before,
         remainder_um=left,
     )
@@ -157,13 +157,9 @@ def _rigid_fields(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6 3"
     return np.stack([*turns, *(np.broadcast_to(axis, points.shape) for axis in np.eye(3))], axis=1)
 
 
-def _without(columns: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _residual(columns: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """What the columns cannot explain of values."""
     return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
-
-
-def _rms(values: Float[np.ndarray, "n"]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _integral(

@@ -147,14 +147,14 @@ def _section(
     options: MarginOptions,
 ) -> MarginSection | None:
     """The section at a point of the line; None where the reference's own edge is not clear."""
-    axes = _axes(tangent)
+    axes = axes_about(tangent)[:2]
     own = reference.section(point, tangent, axes, options)
     true = _edge(own, options)
     if own is None or true is None or 1000 * np.linalg.norm(true.point) > options.max_floor_um:
         return None
     found = scan.section(point, tangent, axes, options)
     edge = _edge(found, options)
-    turned = np.stack([_lateral(axes, tangent, true.outward), true.outward], axis=1)
+    turned = np.stack([axes @ np.cross(tangent, true.outward @ axes), true.outward], axis=1)
     return MarginSection(
         place_mm=point,
         reference=own @ turned,
@@ -202,18 +202,6 @@ def _stations(
     size = np.linalg.norm(chords, axis=1)
     straight = size > _STRAIGHT * 2 * _TANGENT_MM
     return interpolate(s)[straight], chords[straight] / size[straight, None], len(s)
-
-
-def _axes(tangent: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
-    """Two unit vectors that make a right-handed frame with the direction of a line: u x v = tangent."""
-    return axes_about(tangent)[:2]
-
-
-def _lateral(
-    axes: Float[np.ndarray, "2 3"], tangent: Float[np.ndarray, "3"], outward: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "2"]:
-    """Tangent x outward, in the plane."""
-    return axes @ np.cross(tangent, outward @ axes)
 
 
 class _Slicer:

@@ -2,8 +2,8 @@
 
 A panorama that knows which frame each of its pixels came from is evaluated by geometry: the pixel's ray, from where the
 frame truly was, meets the true jaw in a point, and the panorama places that point somewhere in the occlusal plane. The
-best similarity (least squares, Umeyama 1991) of all tooth pixels is removed; what remains is the geometric error.
-It is told once more along the direction in which the panorama looks at the jaw, which may be another than that of the
+best similarity (least squares, Umeyama 1991) of all tooth pixels is removed; what remains is the geometric error. It is
+reported once more along the direction in which the panorama looks at the jaw, which may be another than that of the
 jaw's occlusal frame. The same similarity lays the panorama over the reference render of the true jaw
 (:class:`cuspid.model.trueness.ReferenceRender`), where the pictures are compared. A panorama without that knowledge is
 aligned with it by image features, and only the pictures are compared.
@@ -552,13 +552,13 @@ class _Comparison:
             tooth_coverage_pct=teeth,
             complete=self.panorama.parts == 1 and min(teeth.values()) >= self.options.complete_pct,
             picture=image_scores(grey(laid), shown, grey(self.view.image), self.view.teeth, self.seen),
-            shot=self._against_shot(shot_from_panorama),
+            shot=self._compare_with_shot(shot_from_panorama),
             **figures,
         )
         nowhere = np.zeros((0, 2)), np.zeros(0)
         return PanoramaComparison(score=score, aligned=laid, points_mm=nowhere[0], errors_mm=nowhere[1])
 
-    def _against_shot(self, shot_from_panorama: Similarity2 | None) -> ImageScores | None:
+    def _compare_with_shot(self, shot_from_panorama: Similarity2 | None) -> ImageScores | None:
         if self.shot is None or shot_from_panorama is None:
             return None
         laid, shown = lay_over(self.panorama, self.shot, shot_from_panorama)

@@ -68,7 +68,7 @@ class SmallMotion:
     centre: Float[np.ndarray, "3"]
 
     def changes_um(self, places: Places) -> Float[np.ndarray, "n"]:
-        """By how much it changes the deviations at places."""
+        """Change of the deviations at each place, um."""
         moves = np.cross(self.turn, places.points - self.centre) + self.shift_mm
         return np.asarray(1000 * np.sum(moves * places.normals, axis=1))
 

@@ -91,7 +91,7 @@ def _lay(scan: Mesh, surface: SignedDistance, options: RegistrationOptions, rng:
     return replace(
         alignment,
         mirrored=bool(mirrored),
-        notes=(*notes, *_doubts(alignment), *_rivals(found.poses, found.misfits_mm, found.few)),
+        notes=(*notes, *_doubt_notes(alignment), *_rivals(found.poses, found.misfits_mm, found.few)),
     )
 
 
@@ -164,7 +164,7 @@ def refine(
         closest = surface.closest_points(moved)
         centre = moved.mean(axis=0)
         step = _gauss_newton(moved - centre, closest, _weights(closest))
-        motion = _about(centre, step)
+        motion = _motion_about(centre, step)
         pose = motion @ pose
         if np.abs(motion.apply(moved) - moved).max() < options.tolerance_um / 1000:
             break
@@ -181,7 +181,7 @@ def best_scale(
         centre = moved.mean(axis=0)
         step = _gauss_newton(moved - centre, closest, _weights(closest), with_scale=True)
         before = moved
-        moved = _about(centre, step[:6]).apply(centre + (1 + step[6]) * (moved - centre))
+        moved = _motion_about(centre, step[:6]).apply(centre + (1 + step[6]) * (moved - centre))
         shrinking *= 1 + step[6]
         if np.abs(moved - before).max() < options.tolerance_um / 1000:
             break
@@ -205,7 +205,7 @@ def locate_place(
     return reference_from_scan.inverse().apply(place - offset)
 
 
-def _about(centre: Float[np.ndarray, "3"], step: Float[np.ndarray, "6"]) -> Rigid3:
+def _motion_about(centre: Float[np.ndarray, "3"], step: Float[np.ndarray, "6"]) -> Rigid3:
     """The motion that turns about a centre and shifts."""
     turn = Rigid3.from_rotation_vector(step[:3], np.zeros(3))
     return Rigid3(turn.rotation, centre - turn.rotate(centre) + step[3:])
@@ -256,7 +256,7 @@ def _truncated_mean_mm(points: Float[np.ndarray, "n 3"], surface: SignedDistance
     return float(np.where(closest.on_border, 0.5, np.minimum(np.abs(closest.signed_mm), 0.5)).mean())
 
 
-def _doubts(alignment: Alignment) -> tuple[str, ...]:
+def _doubt_notes(alignment: Alignment) -> tuple[str, ...]:
     notes = []
     if alignment.overlap < 0.6:
         notes.append(f"alignment: doubtful, only {alignment.overlap:.0%} of the scan lies close to the reference")

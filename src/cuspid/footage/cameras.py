@@ -47,7 +47,7 @@ class Shot:
         return encoded.tobytes()
 
     def rgb(self) -> UInt8[np.ndarray, "h w 3"] | None:
-        """To be looked at: RGB of 8 bits; None where it cannot be decoded."""
+        """RGB of 8 bits for display; None where it cannot be decoded."""
         if isinstance(self.data, bytes):
             decoded = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_COLOR)
             return None if decoded is None else cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
@@ -57,8 +57,8 @@ class Shot:
 
 @dataclass(frozen=True, kw_only=True)
 class ExposureOptions(Options):
-    """What is held from the first image to the last; what is not given is held where the camera's own control has
-    brought it."""
+    """Settings that stay fixed from the first image to the last; what is not given stays where the camera's own control
+    has brought it."""
 
     exposure_ms: Annotated[float | None, Range(0.001, 10_000)] = None
     """Exposure time."""
@@ -69,12 +69,12 @@ class ExposureOptions(Options):
     focus: Annotated[float | None, Range(0, 1e6)] = None
     """Position of a focus that can be moved, in the units of the driver."""
     auto: bool = False
-    """Leave exposure, gain, white balance and focus to the camera; then images are not alike, and nothing is held."""
+    """Leave exposure, gain, white balance and focus to the camera; then images are not alike, and nothing is fixed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """What was asked of a camera, and what it says it does."""
+    """A setting that was requested of a camera, and the value that the camera reports."""
 
     name: str
     """Such as ``exposure_ms``."""
@@ -91,8 +91,8 @@ class Setting:
         if self.is_held:
             return f"{self.name} {self.told:g} held"
         if self.told == self.asked:
-            return f"{self.name} {self.told:g} (the driver does not let it be set)"
-        return f"{self.name} {self.asked:g} refused (it says {self.told:g})"
+            return f"{self.name} {self.told:g} (the driver does not allow it to be set)"
+        return f"{self.name} {self.asked:g} refused (it reports {self.told:g})"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from cuspid.footage.cameras import ExposureOptions, Pixels, Ready, Setting, Shot
-from cuspid.footage.jpeg import whole_jpeg
+from cuspid.footage.jpeg import complete_jpeg
 from cuspid.footage.quality import measure_quality, shrink_to_grey
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Options, Range
@@ -67,14 +67,14 @@ class FormatOptions(Options):
     """Images that the camera has compressed, written as they come, where it has such; or uncompressed ones, written as
     PNG."""
     settle_s: Annotated[float, Range(0.1, 60)] = 1.5
-    """How long each camera runs before its exposure is held."""
+    """How long each camera runs before its exposure is fixed."""
 
 
 def open_device(device: str) -> Device:
     """A device of Video4Linux, whose images are taken as they are. Raises InputError where it cannot be opened."""
     if not Path(device).exists():
         raise InputError(f"{device}: no such camera; cuspid record --list names those that are there")
-    with _quiet():
+    with _silence_opencv():
         capture = cv2.VideoCapture(device, cv2.CAP_V4L2)
     if not capture.isOpened():
         raise InputError(
@@ -85,7 +85,7 @@ def open_device(device: str) -> Device:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_opencv() -> Iterator[None]:
     """What OpenCV would print of a device that fails is told in one line."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -159,10 +159,10 @@ class V4L2Camera:
         code = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace").strip()
         capture.set(cv2.CAP_PROP_CONVERT_RGB, 0.0 if code in _AS_DELIVERED else 1.0)
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        wanted = form.width_px or size[0], form.height_px or size[1]
-        if size != wanted:
+        size_px = form.width_px or size[0], form.height_px or size[1]
+        if size != size_px:
             raise InputError(
-                f"{self._device}: delivers {size[0]} x {size[1]} px, not {wanted[0]} x {wanted[1]}; give a size that "
+                f"{self._device}: delivers {size[0]} x {size[1]} px, not {size_px[0]} x {size_px[1]}; give a size that "
                 "it has with --width-px and --height-px"
             )
         return code, size
@@ -187,16 +187,16 @@ class V4L2Camera:
                 capture.set(automatic, _MANUAL if name == "exposure_ms" else 0.0)
             if found < 0 and given is None:  # it has no such control, and nobody asks for it
                 continue
-            wanted = found / units if given is None else given
-            is_taken = capture.set(control, round(wanted * units))
-            told = capture.get(control) / units
+            requested = found / units if given is None else given
+            is_taken = capture.set(control, round(requested * units))
+            reported = capture.get(control) / units
             is_off = automatic is None or capture.get(automatic) in (-1.0, _MANUAL if name == "exposure_ms" else 0.0)
-            is_same = abs(told - wanted) <= max(_SAME * wanted, 0.5 / units)
+            is_same = abs(reported - requested) <= max(_SAME * requested, 0.5 / units)
             settings.append(
                 Setting(
                     name=name,
-                    asked=float(wanted),
-                    told=None if found < 0 else float(told),
+                    asked=float(requested),
+                    told=None if found < 0 else float(reported),
                     is_held=bool(found >= 0 and is_taken and is_off and is_same),
                 )
             )
@@ -214,8 +214,8 @@ class V4L2Camera:
         ratio = max(first, 1.0) / max(second, 1.0)
         if exposure.exposure_ms is None and exposure.gain is None and not 1 / _UNLIKE < ratio < _UNLIKE:
             yield (
-                f"its images are {1 / ratio:.2f} times as bright since the exposure is held: the camera does not tell "
-                "what its automatic had chosen; give --exposure-ms and --gain"
+                f"its images are {1 / ratio:.2f} times as bright since the exposure was fixed: the camera does not "
+                f"report what its automatic had chosen; give --exposure-ms and --gain"
             )
         if not self._is_stamped:
             yield "its driver does not stamp images on this machine's clock; they have the time of their arrival"
@@ -226,14 +226,14 @@ class V4L2Camera:
         now_s = self._clock()
         if not is_read:
             if not Path(self._device).exists():
-                raise InputError(f"{self._device}: it is unplugged; plug it in, and record anew")
+                raise InputError(f"{self._device}: it is unplugged; plug it in, and record again")
             if not self._has_read:
                 raise InputError(f"{self._device}: delivers no images; {_LESS}")
-            raise InputError(f"{self._device}: delivers no more images; look at its plug, and record anew")
+            raise InputError(f"{self._device}: delivers no more images; check its plug, and record again")
         self._has_read = True
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
         self._is_stamped = self._is_stamped and now_s - _MOST_LATE_S < stamp_s <= now_s
-        data = _as_delivered(delivered)
+        data = _whole_image(delivered)
         return None if data is None else Shot(time_s=stamp_s if self._is_stamped else now_s, data=data)
 
 
@@ -241,10 +241,10 @@ _AS_DELIVERED = ("MJPG", "JPEG", "GREY", "Y10", "Y12", "Y16")
 """Pixels that OpenCV hands over as they are, compressed or grey; it converts others to BGR."""
 
 
-def _as_delivered(found: np.ndarray) -> bytes | Pixels | None:
+def _whole_image(found: np.ndarray) -> bytes | Pixels | None:
     """A JPEG file, or pixels; None where it is damaged."""
     if found.dtype == np.uint8 and found.ndim == 2 and min(found.shape) == 1:
-        return whole_jpeg(found.tobytes())
+        return complete_jpeg(found.tobytes())
     return cv2.cvtColor(found, cv2.COLOR_BGR2RGB) if found.ndim == 3 and found.shape[2] == 3 else found.copy()
 
 
@@ -271,7 +271,7 @@ _HAS_OWN, _CAPTURES = 0x80000000, 0x1
 _MOST_FORMATS = 32
 
 
-def cameras_there(root: Path = Path("/dev")) -> tuple[FoundCamera, ...]:
+def find_cameras(root: Path = Path("/dev")) -> tuple[FoundCamera, ...]:
     """The cameras that are plugged in; devices that deliver no images, as of metadata, are left out."""
     devices = [path for path in root.glob("video*") if re.fullmatch(r"video\d+", path.name)]
     ordered = sorted(devices, key=lambda path: int(path.name.removeprefix("video")))
@@ -283,9 +283,9 @@ def _query_device(device: Path, root: Path) -> FoundCamera | None:
     import fcntl  # only where there are such devices
 
     with suppress(OSError), device.open("rb", buffering=0) as stream:
-        said = fcntl.ioctl(stream, _QUERY, bytes(104))
-        card = said[16:48].split(b"\0")[0].decode(errors="replace")
-        all_of_it, own = struct.unpack("II", said[84:92])
+        reply = fcntl.ioctl(stream, _QUERY, bytes(104))
+        card = reply[16:48].split(b"\0")[0].decode(errors="replace")
+        all_of_it, own = struct.unpack("II", reply[84:92])
         if (own if all_of_it & _HAS_OWN else all_of_it) & _CAPTURES:
             place = next((link for link in sorted(root.glob("v4l/by-path/*")) if link.samefile(device)), device)
             return FoundCamera(device=str(device), card=card, place=str(place), formats=tuple(_formats(stream)))
@@ -297,5 +297,5 @@ def _formats(stream: Any) -> Iterator[str]:
 
     with suppress(OSError):
         for index in range(_MOST_FORMATS):
-            said = fcntl.ioctl(stream, _FORMATS, struct.pack("II", index, 1) + bytes(56))
-            yield said[44:48].decode(errors="replace").strip()
+            reply = fcntl.ioctl(stream, _FORMATS, struct.pack("II", index, 1) + bytes(56))
+            yield reply[44:48].decode(errors="replace").strip()

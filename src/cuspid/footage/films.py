@@ -93,7 +93,8 @@ def open_film(camera: str, source: Path) -> Film:
 
 
 def sizes_of(film: Film) -> Iterator[tuple[str, tuple[int, int]]]:
-    """The place of each image and its width and height, as far as the headers tell; for a video, of the first frame."""
+    """The place of each image and its width and height, as far as the headers state them; for a video, of the first
+    frame."""
     for path in film.images:
         try:
             yield str(path), image_size(path)
@@ -108,14 +109,14 @@ def frames_of(film: Film, options: DevelopmentOptions) -> Iterator[FilmFrame]:
     if film.is_video:
         for frame in read_video(film.source):
             where = f"{film.source}: frame {frame.number}"
-            read = partial(_of_video, frame, where, is_grey=options.bayer != "none")
+            read = partial(_convert_video_frame, frame, where, is_grey=options.bayer != "none")
             yield FilmFrame(number=frame.number, time_s=frame.time_s, where=where, stored=read)
     for number, path in enumerate(film.images):
         png = path if path.suffix == ".png" else None
         yield FilmFrame(number=number, time_s=None, where=str(path), stored=partial(read_deep, path), png=png)
 
 
-def _of_video(frame: VideoFrame, where: str, *, is_grey: bool) -> Image:
+def _convert_video_frame(frame: VideoFrame, where: str, *, is_grey: bool) -> Image:
     if frame.damaged:
         raise InputError(f"{where}: damaged; copy the video again")
     return frame.grey() if is_grey else frame.rgb()

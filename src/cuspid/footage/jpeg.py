@@ -16,7 +16,7 @@ _START, _END = b"\xff\xd8", b"\xff\xd9"
 _TABLES, _SCAN = 0xC4, 0xDA
 
 
-def whole_jpeg(sent: bytes) -> bytes | None:
+def complete_jpeg(sent: bytes) -> bytes | None:
     """The file of an image: from its start to its end, with Huffman tables; None where it is not whole."""
     end = sent.rfind(_END)
     if not sent.startswith(_START) or end < 0:

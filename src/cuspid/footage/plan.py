@@ -18,16 +18,16 @@ from cuspid.footage.synchronise import (
     Clock,
     Instant,
     SyncOptions,
-    by_names,
-    by_starts,
-    by_times,
     flash_starts,
     flashes_of,
     jumps_in,
+    match_names,
+    match_starts,
+    match_times,
     motion_starts,
     offset_between,
-    one_by_one,
-    one_clock,
+    separate_instants,
+    synchronise_clocks,
 )
 from cuspid.model.capture import Dropped, Frame
 from cuspid.model.rig import Handpiece
@@ -121,7 +121,7 @@ def plan_import(
         for camera, each in looks.items()
     }
     every, starts = _instants(films, looks, times_s, options.sync)
-    clock = one_clock(every, times_s, is_set=options.sync.sync == "times")
+    clock = synchronise_clocks(every, times_s, is_set=options.sync.sync == "times")
     notes = [
         *_film_notes(films, looks, handpiece),
         *_sync_notes(every, looks, times_s, clock, options.sync),
@@ -129,7 +129,7 @@ def plan_import(
         *_lighting_notes(options.lightings, handpiece),
     ]
     is_kept = [options.sync.sync == "none" or len(films) == 1 or len(instant.numbers) > 1 for instant in every]
-    notes += _alone([instant for instant, kept in zip(every, is_kept, strict=True) if not kept])
+    notes += _lone_image_notes([instant for instant, kept in zip(every, is_kept, strict=True) if not kept])
     chosen = _select_instants(np.flatnonzero(is_kept).tolist(), clock, options.selection)
     wrong = {camera: faults(each, options.quality) for camera, each in looks.items()}
     lit = _lightings(every, clock, options.lightings, handpiece)
@@ -149,26 +149,26 @@ def plan_import(
 # --- times -----------------------------------------------------------------------------------------------------------
 
 
-def _times_of(film: Film, count: int, said: Mapping[str, float]) -> Float[np.ndarray, "_"]:
+def _times_of(film: Film, count: int, table: Mapping[str, float]) -> Float[np.ndarray, "_"]:
     """The time of each frame, from a table that names frames by image or by number, of the film or of a longer one."""
     numbers = {film.name(k): k for k in range(count)}
-    if not set(said) <= set(numbers):
-        numbers = _by_number(film, count, said)
+    if not set(table) <= set(numbers):
+        numbers = _index_by_number(film, count, table)
     found = np.full(count, np.nan)
-    found[[numbers[frame] for frame in said]] = list(said.values())
+    found[[numbers[frame] for frame in table]] = list(table.values())
     return found
 
 
-def _by_number(film: Film, count: int, said: Mapping[str, float]) -> dict[str, int]:
-    if all(frame.isascii() and frame.isdigit() for frame in said):
-        ordered = sorted(said, key=int)
+def _index_by_number(film: Film, count: int, table: Mapping[str, float]) -> dict[str, int]:
+    if all(frame.isascii() and frame.isdigit() for frame in table):
+        ordered = sorted(table, key=int)
         if int(ordered[-1]) < count:
             return {frame: int(frame) for frame in ordered}
         if len(ordered) == count:
             return {frame: k for k, frame in enumerate(ordered)}
     raise InputError(
-        f"the table of times lists {len(said)} frames of {film.camera}, {min(said)} to {max(said)}, but {film.source} "
-        f"has {count} frames, numbered differently; give the table that belongs to the films"
+        f"the table of times lists {len(table)} frames of {film.camera}, {min(table)} to {max(table)}, but "
+        f"{film.source} has {count} frames, numbered differently; give the table that belongs to the films"
     )
 
 
@@ -188,17 +188,17 @@ def _instants(
     """The instants, and where it was found when each camera began."""
     counts = {camera: len(each.level_dn) for camera, each in looks.items()}
     if options.sync == "none":
-        return one_by_one(counts, times_s), None
+        return separate_instants(counts, times_s), None
     if options.sync == "times":
-        return by_times(times_s, options), None
+        return match_times(times_s, options), None
     if options.sync == "names" or len(films) == 1:
-        return by_names(_names(films, counts)), None
+        return match_names(_names(films, counts)), None
     starts = (
         flash_starts({camera: each.level_dn for camera, each in looks.items()}, options)
         if options.sync == "flash"
         else motion_starts({camera: each.change_dn for camera, each in looks.items()}, options)
     )
-    return by_starts(starts, counts), starts
+    return match_starts(starts, counts), starts
 
 
 def _names(films: Films, counts: Mapping[str, int]) -> dict[str, list[str]]:
@@ -240,7 +240,7 @@ def check_lightings(options: ImportOptions, handpiece: Handpiece) -> None:
     for name in options.lightings:
         handpiece.lights_on(name)
     if options.lightings and options.sync.sync == "none":
-        raise InputError("--lightings: lights that take turns are shared by cameras that expose together; give --sync")
+        raise InputError("--lightings: alternating lights require cameras that expose together; give --sync")
 
 
 def _lightings(
@@ -304,12 +304,12 @@ def _lighting_notes(in_turn: Sequence[str], handpiece: Handpiece) -> Iterator[st
     if len(handpiece.lightings) > 1 and not in_turn:
         names = " ".join(each.name for each in handpiece.lightings)
         yield (
-            "which lighting pattern each frame has is not told, which plain teeth need; if they take turns, give "
+            "the lighting pattern of each frame is unknown, but plain teeth need it; if the patterns alternate, give "
             f"--lightings {names} in their order"
         )
 
 
-def _alone(instants: Sequence[Instant]) -> Iterator[str]:
+def _lone_image_notes(instants: Sequence[Instant]) -> Iterator[str]:
     """Images that no other camera has one with."""
     if instants:
         counts = Counter(camera for instant in instants for camera in instant.numbers)

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from cuspid.footage.cameras import ExposureOptions, Pixels, Ready, Shot
 from cuspid.footage.films import DevelopmentOptions, frames_of, open_film, sizes_of
-from cuspid.footage.jpeg import whole_jpeg
+from cuspid.footage.jpeg import complete_jpeg
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.inputs import read_bytes
 from cuspid.storage.videos import read_jpegs, video_rate
 
 USUAL_PER_S = 30.0
-"""Rate of a film that does not tell its own."""
+"""Rate of a film that does not state its own."""
 _JPEG = (".jpg", ".jpeg")
 
 Sleep = Callable[[float], None]
@@ -42,7 +42,7 @@ class FilmCamera:
             after_s = number / self._rate
             if self._asked is None and time_s is not None and first_s is not None:
                 after_s = time_s - first_s
-            yield Shot(time_s=_when(start_s + after_s, self._sleep), data=data)
+            yield Shot(time_s=_wait_until(start_s + after_s, self._sleep), data=data)
 
     def close(self) -> None:
         """See the protocol."""
@@ -50,7 +50,7 @@ class FilmCamera:
     def _images(self) -> Iterator[tuple[float | None, bytes | Pixels]]:
         film = self._film
         if film.is_video and (packets := read_jpegs(film.source)) is not None:
-            yield from ((time_s, jpeg) for time_s, sent in packets if (jpeg := whole_jpeg(sent)) is not None)
+            yield from ((time_s, jpeg) for time_s, sent in packets if (jpeg := complete_jpeg(sent)) is not None)
         elif film.images and all(path.suffix.lower() in _JPEG for path in film.images):
             yield from ((None, read_bytes(path, "image")) for path in film.images)
         else:
@@ -85,14 +85,14 @@ class RenderedCamera:
         while True:
             after_s = self._delay_s + number / self._rate
             data = self._render(after_s)
-            yield Shot(time_s=_when(start_s + after_s, self._sleep), data=data)
+            yield Shot(time_s=_wait_until(start_s + after_s, self._sleep), data=data)
             number += 1
 
     def close(self) -> None:
         """See the protocol."""
 
 
-def _when(due_s: float, sleep: Sleep) -> float:
+def _wait_until(due_s: float, sleep: Sleep) -> float:
     """A moment, once it has come."""
     if (left_s := due_s - time.monotonic()) > 0:
         sleep(left_s)

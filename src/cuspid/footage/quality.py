@@ -86,7 +86,7 @@ def measure_quality(
 
 def faults(looks: Looks, options: QualityOptions) -> dict[int, str]:
     """What is wrong with the unusable frames, by number."""
-    usual = _usual_sharpness(looks, options)
+    usual = _median_sharpness(looks, options)
     found = {}
     for number in range(len(looks.level_dn)):
         share = looks.sharpness[number] / usual[number] if usual[number] > 0 else 1.0
@@ -103,7 +103,7 @@ def faults(looks: Looks, options: QualityOptions) -> dict[int, str]:
     return found
 
 
-def _usual_sharpness(looks: Looks, options: QualityOptions) -> Float[np.ndarray, "n"]:
+def _median_sharpness(looks: Looks, options: QualityOptions) -> Float[np.ndarray, "n"]:
     """Running median over the frames that are neither dark nor burnt; 0 where there are none."""
     use = looks.readable & (looks.bright_dn >= options.dark_below_dn) & (looks.burnt <= options.burnt_above)
     usual = np.zeros(len(use))

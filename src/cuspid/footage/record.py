@@ -177,7 +177,7 @@ class Recording:
         while (item := self._next(queue)) is not None:
             number, shot = item
             frame = f"{number:0{_DIGITS}d}"
-            with _anew_where_full():
+            with _report_full_disk():
                 write_bytes(self._folder / name / f"{frame}{shot.suffix}", shot.file())
                 table.add(name, frame, f"{shot.time_s:.6f}")
             with self._lock:
@@ -199,7 +199,7 @@ _ROUNDING = 1e-6
 
 
 @contextmanager
-def _anew_where_full() -> Iterator[None]:
+def _report_full_disk() -> Iterator[None]:
     """A recording is not continued, as other work is, once there is room."""
     try:
         yield

@@ -1,5 +1,5 @@
-"""From footage to a capture: look at every frame once (:func:`survey`), plan (:mod:`cuspid.footage.plan`), and make the
-usable images (:func:`develop`).
+"""Turns footage into a capture: look at every frame once (:func:`survey`), plan (:mod:`cuspid.footage.plan`), and make
+the usable images (:func:`develop`).
 
 The measures of each frame are kept, and so is what each image was made from: an interrupted import resumes, and another
 attempt at synchronising does not read the films again.
@@ -114,11 +114,11 @@ def develop(
     """The capture made by a plan, in a folder; existing images are kept."""
     images = ImageFolder(folder)
     stage = Stage("images", folder, options, _CODE)
-    wanted: dict[str, dict[int, Path]] = {camera: {} for camera in films}
+    targets: dict[str, dict[int, Path]] = {camera: {} for camera in films}
     for frame in plan.frames:
         for camera in frame.cameras:
-            wanted[camera][plan.numbers[frame.name][camera]] = images.path(frame.name, camera)
-    map_in_threads(lambda film: _develop(film, wanted[film.camera], stage, options, progress), films.values())
+            targets[camera][plan.numbers[frame.name][camera]] = images.path(frame.name, camera)
+    map_in_threads(lambda film: _develop(film, targets[film.camera], stage, options, progress), films.values())
     capture = Capture(
         handpiece=handpiece, frames=plan.frames, source=images, left_out=tuple(map(Bad.as_dropped, plan.bad))
     )
@@ -127,19 +127,19 @@ def develop(
 
 
 def _develop(
-    film: Film, wanted: Mapping[int, Path], stage: Stage, options: DevelopmentOptions, progress: Progress
+    film: Film, targets: Mapping[int, Path], stage: Stage, options: DevelopmentOptions, progress: Progress
 ) -> None:
     """Write the wanted images of a film, by the numbers of its frames, that are not there yet."""
-    keys = {number: stage.key({"film": film.digest, "frame": str(number)}) for number in wanted}
-    left = {number for number, path in wanted.items() if not stage.has(keys[number], [path])}
+    keys = {number: stage.key({"film": film.digest, "frame": str(number)}) for number in targets}
+    left = {number for number, path in targets.items() if not stage.has(keys[number], [path])}
     frames = frames_of(film, options)
     while left:
         frame = next(frames)
         if frame.number in left:
-            _write(frame, wanted[frame.number], options)
-            stage.record(keys[frame.number], [wanted[frame.number]])
+            _write(frame, targets[frame.number], options)
+            stage.record(keys[frame.number], [targets[frame.number]])
             left.remove(frame.number)
-            progress(f"{film.camera} images", len(wanted) - len(left), len(wanted))
+            progress(f"{film.camera} images", len(targets) - len(left), len(targets))
 
 
 def _write(frame: FilmFrame, path: Path, options: DevelopmentOptions) -> None:

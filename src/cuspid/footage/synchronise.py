@@ -83,7 +83,7 @@ class Offset:
 # --- by name, number and time --------------------------------------------------------------------------------------
 
 
-def by_names(names: Mapping[str, Sequence[str]]) -> tuple[Instant, ...]:
+def match_names(names: Mapping[str, Sequence[str]]) -> tuple[Instant, ...]:
     """Images with the same name, given for each camera the names of its frames, in the order of the numbers in them."""
     numbers = {camera: {name: k for k, name in enumerate(each)} for camera, each in names.items()}
     every = sorted(set().union(*names.values()), key=name_order)
@@ -93,7 +93,7 @@ def by_names(names: Mapping[str, Sequence[str]]) -> tuple[Instant, ...]:
     )
 
 
-def by_starts(starts: Mapping[str, int], counts: Mapping[str, int]) -> tuple[Instant, ...]:
+def match_starts(starts: Mapping[str, int], counts: Mapping[str, int]) -> tuple[Instant, ...]:
     """Frames of the same instant, given the instant of each camera's first frame and its number of frames."""
     last = max(starts[camera] + count for camera, count in counts.items())
     running = [
@@ -102,7 +102,7 @@ def by_starts(starts: Mapping[str, int], counts: Mapping[str, int]) -> tuple[Ins
     return _number_groups(running)
 
 
-def by_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
+def match_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
     """Images that are no farther apart in time than a share of the time between frames.
 
     Starting from the earliest image, each takes the next ones of other cameras with it; an image without a time belongs
@@ -135,7 +135,7 @@ def by_times(times_s: Signals, options: SyncOptions) -> tuple[Instant, ...]:
     return _number_groups(groups)
 
 
-def one_by_one(counts: Mapping[str, int], times_s: Signals) -> tuple[Instant, ...]:
+def separate_instants(counts: Mapping[str, int], times_s: Signals) -> tuple[Instant, ...]:
     """Each image by itself, in the order of their times if all have one, otherwise camera by camera."""
     images = [(camera, number) for camera, count in counts.items() for number in range(count)]
     if all(np.isfinite(each).all() for each in times_s.values()):
@@ -187,7 +187,7 @@ class Clock:
     """The usual time between frames."""
 
 
-def one_clock(instants: Sequence[Instant], times_s: Signals, *, is_set: bool) -> Clock | None:
+def synchronise_clocks(instants: Sequence[Instant], times_s: Signals, *, is_set: bool) -> Clock | None:
     """The times of instants. The clocks of the cameras are set by the median difference, unless they already are
     (``is_set``).
 
@@ -223,8 +223,8 @@ def flash_starts(brightness: Signals, options: SyncOptions) -> dict[str, int]:
     for camera, its in flashes.items():
         if len(its) != len(flashes[model]):
             raise InputError(
-                f"{camera}: {_at_frames(its)}, but in {model} {_at_frames(flashes[model])}; cut the films so that all "
-                "show the same ones, or use another --sync"
+                f"{camera}: {_describe_flashes(its)}, but in {model} {_describe_flashes(flashes[model])}; cut the "
+                "films so that all show the same ones, or use another --sync"
             )
         gaps, others = (np.diff(each) for each in (its, flashes[model]))
         if (np.abs(gaps - others) > 1).any():
@@ -233,10 +233,10 @@ def flash_starts(brightness: Signals, options: SyncOptions) -> dict[str, int]:
                 f"{camera}: two flashes are {gaps[at]} frames apart, but {others[at]} in {model}: the frame rates "
                 "differ, or frames were dropped; use --sync times, or film again"
             )
-    return _from_zero({camera: -its[0] for camera, its in flashes.items()})
+    return _shift_to_zero({camera: -its[0] for camera, its in flashes.items()})
 
 
-def _at_frames(flashes: Sequence[int]) -> str:
+def _describe_flashes(flashes: Sequence[int]) -> str:
     """How many flashes there are, and where."""
     places = ", ".join(map(str, flashes))
     return f"one flash, at frame {places}" if len(flashes) == 1 else f"{len(flashes)} flashes, at frames {places}"
@@ -310,12 +310,12 @@ def motion_starts(motion: Signals, options: SyncOptions) -> dict[str, int]:
                 f"{one} and {other}: from motion, {each.frames} frames apart, but "
                 f"{starts[other] - starts[one]} by way of the other cameras; use another --sync"
             )
-    return _from_zero(starts)
+    return _shift_to_zero(starts)
 
 
 def offset_between(one: Float[np.ndarray, "m"], other: Float[np.ndarray, "n"], options: SyncOptions) -> Offset:
     """How much later the other camera began, by the correlation of the quick changes in both signals."""
-    first, second = _quick(one), _quick(other)
+    first, second = _high_pass(one), _high_pass(other)
     offsets, found, overlaps = _correlations(first, second)
     usable = overlaps >= max(2 * _SLOW, options.overlap_share * min(len(one), len(other)))
     if usable.sum() < _SLOW:
@@ -366,7 +366,7 @@ def _correlations(
     return np.arange(len(one) + len(other) - 1) - (len(other) - 1), products / power, overlaps
 
 
-def _quick(signal: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _high_pass(signal: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """What changes quickly, in its usual size; NaN where there was none."""
     logs = np.log(_fill_gaps(signal) + 0.1)
     quick = logs - median_filter(logs, _SLOW, mode="nearest")
@@ -387,6 +387,6 @@ def _robust_sigma(values: Float[np.ndarray, "n"]) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
-def _from_zero(starts: Mapping[str, int]) -> dict[str, int]:
+def _shift_to_zero(starts: Mapping[str, int]) -> dict[str, int]:
     first = min(starts.values())
     return {camera: start - first for camera, start in starts.items()}

@@ -1,4 +1,4 @@
-"""From depth maps to one clean mesh."""
+"""Fuses depth maps into one clean mesh."""
 
 from cuspid.fusion.cleaning import CleaningOptions, CleaningReport, clean
 from cuspid.fusion.depth_fusion import FusionOptions, fuse

@@ -20,7 +20,7 @@ def find_bends(mesh: Mesh, rings: int) -> Bool[np.ndarray, "v"]:
     _mark_bent(mesh.faces, mesh.vertex_normals, np.cos(np.deg2rad(_BENT_DEG)), found)
     for _ in range(rings):
         if found.any():
-            found = _with_neighbours(mesh.faces, found)
+            found = _dilate(mesh.faces, found)
     return found
 
 
@@ -74,7 +74,7 @@ def _mark_bent(faces, normals, cosine, found):
 
 @kernel
 @no_type_check
-def _with_neighbours(faces, marked):
+def _dilate(faces, marked):
     """What is marked, and the vertices that share a face with it."""
     more = marked.copy()
     for face in faces:

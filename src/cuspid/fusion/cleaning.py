@@ -64,7 +64,7 @@ class CleaningReport:
     sharpened_vertices: int = 0
     """Vertices that were moved afterwards onto sharp edges (:mod:`cuspid.fusion.sharp_edges`)."""
     scale: Literal["known", "unknown"] = "known"
-    """unknown: nothing tells the scale, and all lengths are in a unit of their own, whatever the names say."""
+    """unknown: all lengths are in an arbitrary unit, whatever the names say."""
     funnel: Mapping[str, float] | None = None
     """What was left of the pixels from step to step, % (:class:`cuspid.model.reconstruction.Funnel`); None where that
     is not known."""
@@ -81,8 +81,8 @@ def clean(mesh: Mesh, detail_mm: float, options: CleaningOptions | None = None) 
     crowded = non_manifold_faces(cleaned)
     cleaned = cleaned.submesh(~crowded)
     sides = _Sides.of(cleaned)
-    cleaned, split = _with_split_fans(cleaned, sides)  # which leaves the sides as they are
-    floating, pieces = _floating(cleaned.face_areas, sides.face_pieces, detail_mm, options)
+    cleaned, split = _split_fans(cleaned, sides)  # which leaves the sides as they are
+    floating, pieces = _floating_pieces(cleaned.face_areas, sides.face_pieces, detail_mm, options)
     cleaned = cleaned.submesh(~floating)
     outer, holes = boundaries(cleaned)
     report = CleaningReport(
@@ -179,7 +179,7 @@ def non_manifold_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     return bad[sides.edge].reshape(3, -1).any(axis=0) | (mesh.face_areas == 0)
 
 
-def _floating(
+def _floating_pieces(
     areas: Float[np.ndarray, "f"], pieces: Int[np.ndarray, "f"], detail_mm: float, options: CleaningOptions
 ) -> tuple[Bool[np.ndarray, "f"], int]:
     """Faces of pieces that are small in details or beside the total, and beside the largest one; and the number of such
@@ -190,7 +190,7 @@ def _floating(
     return small[pieces], int(small.sum())
 
 
-def _with_split_fans(mesh: Mesh, sides: _Sides) -> tuple[Mesh, int]:
+def _split_fans(mesh: Mesh, sides: _Sides) -> tuple[Mesh, int]:
     """The mesh with a separate vertex for each fan of faces around a point, and how many vertices were added."""
     corners = mesh.faces.size
     if corners == 0:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, no_type_check
+from typing import Annotated, NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -29,7 +29,7 @@ from cuspid.model.reconstruction import DepthMap, SurfacePoints
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.options import Options, Range
 from cuspid.runtime.progress import Progress, silent
-from cuspid.runtime.workers import in_shares, map_batches
+from cuspid.runtime.workers import map_batches, run_in_shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +77,11 @@ class FusionOptions(Options):
         return min(0.001 * frames, 0.01) if self.min_weight is None else self.min_weight
 
     def resolve(self, detail_mm: float, footprint_mm: float) -> FusionOptions:
-        """With the grid for a handpiece whose pixels have a footprint that may be less than the detail.
+        """The options with the voxel size for a handpiece, whose footprint may be less than its detail.
 
-        Depths that scatter tell a slope to scatter / distance, averaged over (distance / footprint)**2 pixels: with a
-        spacing like the square root of both the mesh is not rougher than one whose detail is the footprint. They are
-        blended as far from the surface as they scatter.
+        Depths that scatter determine a slope to scatter / distance, averaged over (distance / footprint)**2 pixels:
+        with a spacing like the square root of both the mesh is not rougher than one whose detail is the footprint. They
+        are blended as far from the surface as they scatter.
         """
         if self.voxel_mm is not None or detail_mm <= footprint_mm:
             return self
@@ -213,14 +213,14 @@ CHUNK = 256
 """Number of vertices that are tested together for being in the view of a depth map."""
 
 
-@dataclass(frozen=True, eq=False)
-class Voter:
-    """A depth map, and the vertices that it may see."""
+class Voter(NamedTuple):
+    """A depth map, and the vertices that it may see, for a kernel."""
 
     evidence: Evidence
     """What it says."""
-    cam_from_world: Rigid3
-    """Where its camera was."""
+    rotation: Float[np.ndarray, "3 3"]
+    """Of ``cam_from_world``, as ``translation``."""
+    translation: Float[np.ndarray, "3"]
     chunks: Int[np.ndarray, "k"]
     """Numbers of the chunks of vertices in its view."""
     colors: UInt8[np.ndarray, "p 3"]
@@ -231,14 +231,9 @@ class Voter:
     """Number of its frame, starting from 1."""
 
 
-@dataclass(eq=False)
-class Votes:
-    """What the depth maps say about each vertex of a rough mesh. Not frozen: it is an accumulator."""
+class _Tally(NamedTuple):
+    """Sums of what depth maps say about each vertex, which a kernel adds to."""
 
-    rough: Mesh
-    """The zero level of the volume."""
-    balls: Float[np.ndarray, "c 4"]
-    """Centre and radius (mm) of a ball around each chunk of consecutive vertices, which lie close together."""
     moment: Float[np.ndarray, "v 3"]
     """Sum of weights, and of weights times distance along the vertex normal (mm) and its square."""
     color: Float[np.ndarray, "v 3"]
@@ -255,6 +250,32 @@ class Votes:
     """Largest inverse variance (1/mm^2) that one of them states; 0 where none states any."""
 
     @staticmethod
+    def empty(count: int) -> _Tally:
+        """Of so many vertices."""
+        maps, last = np.zeros((2, count), dtype=np.int64)
+        return _Tally(
+            moment=np.zeros((count, 3)),
+            color=np.zeros((count, 3)),
+            maps=maps,
+            measured=np.zeros(count, dtype=bool),
+            last=last,
+            frames=np.zeros((count, 2)),
+            stated=np.zeros(count),
+        )
+
+
+@dataclass(eq=False)
+class Votes:
+    """What the depth maps say about each vertex of a rough mesh. Not frozen: it is an accumulator."""
+
+    rough: Mesh
+    """The zero level of the volume."""
+    balls: Float[np.ndarray, "c 4"]
+    """Centre and radius (mm) of a ball around each chunk of consecutive vertices, which lie close together."""
+    tally: _Tally
+    """The votes so far."""
+
+    @staticmethod
     def empty(rough: Mesh) -> Votes:
         """An empty tally for a mesh."""
         count = len(rough.vertices)
@@ -263,45 +284,25 @@ class Votes:
         for ball, chunk in zip(balls, chunks, strict=True):
             ball[:3] = (chunk.min(axis=0) + chunk.max(axis=0)) / 2
             ball[3] = np.linalg.norm(chunk - ball[:3], axis=1).max()
-        moment, color, frames = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 2))
-        maps, last = np.zeros((2, count), dtype=np.int64)
-        return Votes(rough, balls, moment, color, maps, np.zeros(count, dtype=bool), last, frames, np.zeros(count))
+        return Votes(rough, balls, _Tally.empty(count))
 
     def in_view(self, evidence: Evidence, depth_map: DepthMap, cam_from_world: Rigid3, frame: int) -> Voter:
         """A depth map with the vertices that it may see; ``frame`` is the number of its frame, starting from 1."""
-        chunks = self._in_view(depth_map.camera, cam_from_world)
-        return Voter(evidence, cam_from_world, chunks, colors_of(depth_map), depth_map.sigma_mm.ravel(), frame)
+        chunks = self._chunks_in_view(depth_map.camera, cam_from_world)
+        colors, sigma_mm = colors_of(depth_map), depth_map.sigma_mm.ravel()
+        return Voter(evidence, cam_from_world.rotation, cam_from_world.translation, chunks, colors, sigma_mm, frame)
 
     def collect(self, voters: Sequence[Voter], agreement_mm: float) -> None:
         """Let depth maps vote, one after the other, on the vertices that they see."""
+        vertices, normals = self.rough.vertices, self.rough.vertex_normals
 
         def work(share: int, shares: int) -> None:
             for voter in voters:
-                _vote(
-                    voter.chunks,
-                    share,
-                    shares,
-                    self.rough.vertices,
-                    self.rough.vertex_normals,
-                    voter.cam_from_world.rotation,
-                    voter.cam_from_world.translation,
-                    *voter.evidence.arrays,
-                    voter.colors,
-                    voter.sigma_mm,
-                    agreement_mm,
-                    self.moment,
-                    self.color,
-                    self.maps,
-                    self.measured,
-                    self.last,
-                    self.frames,
-                    voter.frame,
-                    self.stated,
-                )
+                _vote(voter, vertices, normals, agreement_mm, self.tally, share, shares)
 
-        in_shares(work)
+        run_in_shares(work)
 
-    def _in_view(self, camera: Camera, cam_from_world: Rigid3) -> Int[np.ndarray, "k"]:
+    def _chunks_in_view(self, camera: Camera, cam_from_world: Rigid3) -> Int[np.ndarray, "k"]:
         """Chunks whose ball meets the pyramid of view (a few more, never less)."""
         centres, radii = cam_from_world.apply(self.balls[:, :3]), self.balls[:, 3]
         corners = camera.rays(
@@ -313,52 +314,34 @@ class Votes:
 
     def outcome(self, min_maps: int) -> Fused:
         """The mesh with its vertices at the mean of the depth maps, coloured, without what too few maps confirm."""
-        total = np.maximum(self.moment[:, :1], 1e-12)
-        vertices = self.rough.vertices + self.rough.vertex_normals * self.moment[:, 1:2] / total
-        colors: UInt8[np.ndarray, "v 3"] = np.rint(self.color / total).clip(0, 255).astype(np.uint8)
-        confirmed = (self.maps >= min_maps) & self.measured
+        tally = self.tally
+        total = np.maximum(tally.moment[:, :1], 1e-12)
+        vertices = self.rough.vertices + self.rough.vertex_normals * tally.moment[:, 1:2] / total
+        colors: UInt8[np.ndarray, "v 3"] = np.rint(tally.color / total).clip(0, 255).astype(np.uint8)
+        confirmed = (tally.maps >= min_maps) & tally.measured
         kept = confirmed[self.rough.faces].all(axis=1)
         used = used_vertices(self.rough.faces[kept], len(self.rough.vertices))
         return Fused(Mesh(vertices, self.rough.faces, colors).submesh(kept), self._sigma_mm()[used])
 
     def _sigma_mm(self) -> Float[np.ndarray, "v"]:
-        mean, square = (self.moment[:, 1:] / np.maximum(self.moment[:, :1], 1e-12)).T
+        moment, stated = self.tally.moment, self.tally.stated
+        mean, square = (moment[:, 1:] / np.maximum(moment[:, :1], 1e-12)).T
         variance = np.maximum(square - mean**2, 0)
         # As many frames of equal weight (L. Kish, Survey Sampling, 1965).
-        frames = np.maximum(self.moment[:, 0] ** 2 / np.maximum(self.frames[:, 1], 1e-24), 1)
+        frames = np.maximum(moment[:, 0] ** 2 / np.maximum(self.tally.frames[:, 1], 1e-24), 1)
         several = frames > _SEVERAL
-        told = variance[several] * frames[several] / (frames[several] - 1)
-        usual = np.median(told) if len(told) else np.where(self.stated > 0, 1 / np.maximum(self.stated, 1e-24), 0)
+        observed = variance[several] * frames[several] / (frames[several] - 1)
+        usual = np.median(observed) if len(observed) else np.where(stated > 0, 1 / np.maximum(stated, 1e-24), 0)
         return np.asarray(np.sqrt((frames * variance + _USUAL * usual) / (frames - 1 + _USUAL) / frames))
 
 
 @kernel
 @no_type_check
-def _vote(
-    chunks,
-    share,
-    shares,
-    vertices,
-    normals,
-    rotation,
-    translation,
-    plane,
-    weights,
-    intrinsics,
-    colors,
-    sigma,
-    agreement,
-    moment,
-    color,
-    maps,
-    measured,
-    last,
-    frames,
-    frame,
-    stated,
-):
+def _vote(voter, vertices, normals, agreement, tally, share, shares):
     """Each vertex of a share of the chunks that a depth map sees from its outer side and near its surface gets the
     map's vote."""
+    evidence, rotation, translation, chunks, colors, sigma, frame = voter
+    moment, color, maps, measured, last, frames, stated = tally
     seen, x, normal = np.zeros(6), np.zeros(3), np.zeros(3)
     for chunk in chunks:
         if chunk % shares != share:
@@ -369,12 +352,12 @@ def _vote(
                 for m in range(3):
                     x[k] += rotation[k, m] * vertices[n, m]
                     normal[k] += rotation[k, m] * normals[n, m]
-            if x[2] <= 0 or not observe(plane, weights, intrinsics, x[0], x[1], x[2], seen):
+            if x[2] <= 0 or not observe(evidence, x[0], x[1], x[2], seen):
                 continue
             distance = seen[0]
             facing = normal[0] * seen[2] + normal[1] * seen[3] + normal[2] * seen[4]
             scatter, within, least_facing = sigma[int(seen[5])], agreement, _LEAST_FACING
-            steep = scatter * intrinsics[0] / (x[2] * _STEEP)
+            steep = scatter * evidence.intrinsics[0] / (x[2] * _STEEP)
             if steep > 1:  # false where it is not known
                 within = max(agreement, _SIGMAS * scatter)
                 least_facing = 1 / np.hypot(1.0, steep * _LEAST_TAN)

@@ -8,8 +8,7 @@ side of the camera. A point is evaluated at the pixel nearest to its projection.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -35,9 +34,8 @@ EXTRAPOLATED = 0.1
 """Weight of a pixel without depth beside pixels with depth, relative to theirs."""
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """A depth map prepared for queries."""
+class Evidence(NamedTuple):
+    """A depth map prepared for queries, by kernels, too."""
 
     plane: Float[np.ndarray, "h w 4"]
     """Hessian normal form (n, d) of the plane at each pixel, in the camera frame, d in mm. float32."""
@@ -45,11 +43,6 @@ class Evidence:
     """Confidence times the cosine between ray and normal, 0 where the depth is unknown. float32."""
     intrinsics: Float[np.ndarray, "4"]
     """fx, fy, cx, cy with the first pixel centre at 0."""
-
-    @property
-    def arrays(self) -> tuple[Any, ...]:
-        """The arrays for numba."""
-        return self.plane, self.weight, self.intrinsics
 
     def nearest(self, reach_px: int) -> Int[np.ndarray, "h w"]:
         """Flat index of the nearest pixel with a known depth, -1 if none is within reach."""
@@ -149,8 +142,9 @@ def _extend_planes(plane, weight):
 
 @kernel(inline="always")
 @no_type_check
-def observe(plane, weight, intrinsics, right, down, depth, seen):
+def observe(evidence, right, down, depth, seen):
     """Evaluate a point of the camera frame in front of the camera; False where the map has no answer."""
+    plane, weight, intrinsics = evidence
     inverse = 1 / depth
     u = intrinsics[0] * right * inverse + intrinsics[2] + 0.5
     v = intrinsics[1] * down * inverse + intrinsics[3] + 0.5
@@ -169,13 +163,14 @@ def observe(plane, weight, intrinsics, right, down, depth, seen):
 
 @kernel
 @no_type_check
-def observe_foot(plane, weight, intrinsics, nearest, farthest, right, down, depth, seen):
+def observe_foot(evidence, nearest, farthest, right, down, depth, seen):
     """As :func:`observe`, for a point whose own pixel has no answer: the pixel at the foot of its perpendicular is
     used, if the surface is seen there and is not farther away than ``farthest``. A camera that looks along a slope
     looks past it through points that lie outside of it.
 
     ``nearest`` is the result of :meth:`Evidence.nearest`.
     """
+    plane, weight, intrinsics = evidence
     height, width = weight.shape
     u = intrinsics[0] * right / depth + intrinsics[2] + 0.5
     v = intrinsics[1] * down / depth + intrinsics[3] + 0.5
@@ -190,7 +185,7 @@ def observe_foot(plane, weight, intrinsics, nearest, farthest, right, down, dept
     if abs(distance) > farthest or depth - distance * z <= 0:
         return False
     foot = right - distance * x, down - distance * y, depth - distance * z
-    if not observe(plane, weight, intrinsics, foot[0], foot[1], foot[2], seen):
+    if not observe(evidence, foot[0], foot[1], foot[2], seen):
         return False
     # The plane seen there lies far from the foot where the slope ended.
     if abs(seen[0]) > _SAME_SURFACE * farthest:

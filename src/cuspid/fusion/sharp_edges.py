@@ -23,7 +23,7 @@ from cuspid.fusion.volume import neighbour_keys, pack
 from cuspid.model.mesh import Mesh, used_vertices
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.options import Options, Range
-from cuspid.runtime.workers import in_shares
+from cuspid.runtime.workers import run_in_shares
 
 _RINGS = 2
 """So many vertices beside a place where the surface bends are tried, too."""
@@ -48,7 +48,7 @@ class SharpEdgeOptions(Options):
     reach: Annotated[float, Range(1, 1000)] = 16.5
     """The flanks are looked for within this distance (0.2 mm at 12 um)."""
     inner: Annotated[float, Range(0, 1000)] = 5.0
-    """What lies within this distance from an edge may be rounded or cut off, and does not tell where it is (0.06 mm at
+    """What lies within this distance from an edge may be rounded or cut off, and does not show where it is (0.06 mm at
     12 um)."""
     max_outwards: Annotated[float, Range(0.01, 1000)] = 2.0
     """What lies farther below an edge than measuring rounds it (0.024 mm at 12 um) is round."""
@@ -85,8 +85,8 @@ def _move_to_edges(
 ) -> Float[np.ndarray, "v 3"]:
     """The vertices, with those of the candidates that an edge asks for on it."""
     foot, along = _lines(mesh, candidates, detail_mm, options)
-    places = _onto_edges(mesh, foot, along, options.max_outwards * detail_mm)
-    return _without_turned(mesh, np.flatnonzero(np.isfinite(places[:, 0])), places)
+    places = _targets_on_edges(mesh, foot, along, options.max_outwards * detail_mm)
+    return _undo_flips(mesh, np.flatnonzero(np.isfinite(places[:, 0])), places)
 
 
 def _within_reach(mesh: Mesh, candidates: Bool[np.ndarray, "v"], reach_mm: float) -> Bool[np.ndarray, "f"]:
@@ -146,13 +146,13 @@ def _lines(
     def work(share: int, shares: int) -> None:
         _find_lines(surface, candidates, share, shares, limits, foot, along)
 
-    in_shares(work)
+    run_in_shares(work)
     inwards = ~(_outwards(mesh, np.arange(len(foot)), foot) > 0)
     foot[inwards] = along[inwards] = np.nan
     return foot, along
 
 
-def _onto_edges(
+def _targets_on_edges(
     mesh: Mesh, foot: Float[np.ndarray, "v 3"], along: Float[np.ndarray, "v 3"], most_mm: float
 ) -> Float[np.ndarray, "v 3"]:
     """New places of the vertices, NaN for those that stay: of the two ends of each side of a face that crosses an edge,
@@ -184,9 +184,7 @@ def _outwards(mesh: Mesh, vertices: Int[np.ndarray, "n"], places: Float[np.ndarr
     return np.asarray(((places - mesh.vertices[vertices]) * mesh.vertex_normals[vertices]).sum(axis=1))
 
 
-def _without_turned(
-    mesh: Mesh, moved: Int[np.ndarray, "n"], places: Float[np.ndarray, "v 3"]
-) -> Float[np.ndarray, "v 3"]:
+def _undo_flips(mesh: Mesh, moved: Int[np.ndarray, "n"], places: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     """The vertices with those that are moved, but for corners of faces that would turn over."""
     vertices = mesh.vertices.copy()
     vertices[moved] = places[moved]

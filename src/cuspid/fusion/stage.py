@@ -71,7 +71,7 @@ def fuse(
     normal (um): that of its depth and, if they are ``expected``, of the poses and the calibration.
 
     ``made_from`` is the digest of the depth maps, which may be iterated more than once; ``detail_mm`` is the detail
-    that the handpiece shows. Raises ReconstructionError where no surface is left, and tells what took it.
+    that the handpiece shows. Raises ReconstructionError where no surface is left, with the reason.
     """
     stage = Stage("mesh", folder, [fusion, cleaning, sharp_edges, detail_mm], _CODE)
     files = [folder / name for name in ("mesh.json", "mesh.stl", "mesh.ply")]
@@ -81,7 +81,7 @@ def fuse(
         funnel = sum_funnels(depth_map.funnel for depth_map in depths)
         cleaned, report = clean(raw.mesh, detail_mm, cleaning)
         if not len(cleaned.faces):
-            raise ReconstructionError(f"no surface: {_what_took_it(funnel, len(raw.mesh.faces))}")
+            raise ReconstructionError(f"no surface: {_explain_empty_surface(funnel, len(raw.mesh.faces))}")
         sigma_um = _sigma_um(cleaned, raw, expected)
         mesh, moved = sharpen_edges(cleaned, detail_mm, sharp_edges)
         scale: Literal["known", "unknown"] = "known" if has_scale else "unknown"
@@ -105,10 +105,10 @@ def fuse(
     return made.mesh, made.vertex_values[SIGMA]
 
 
-def _what_took_it(funnel: Funnel | None, faces: int) -> str:
+def _explain_empty_surface(funnel: Funnel | None, faces: int) -> str:
     """Why nothing is left, and what to change."""
     if funnel is None or not funnel.kept:
-        told = "the depth maps are empty" if funnel is None else f"the depth maps are empty ({funnel.summary})"
+        finding = "the depth maps are empty" if funnel is None else f"the depth maps are empty ({funnel.summary})"
         advice = {
             "begun": "the images overlap too little, are out of focus, or their depth lies outside the depth range of "
             "the calibration",
@@ -117,7 +117,7 @@ def _what_took_it(funnel: Funnel | None, faces: int) -> str:
             "agreed": "views contradict each other: check the calibration and the poses",
             "kept": "what agrees is scattered: the images need more texture or sharper focus",
         }
-        return f"{told}; {advice[funnel.narrowest] if funnel else 'the images need texture or sharper focus'}"
+        return f"{finding}; {advice[funnel.narrowest] if funnel else 'the images need texture or sharper focus'}"
     if not faces:
         return f"no {FusionOptions.min_maps} depth maps confirm the same surface ({funnel.summary}); check the poses"
     return f"cleaning removed all of {faces:,} faces; lower --cleaning.min-piece-width ({funnel.summary})"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from cuspid.fusion.evidence import Evidence, observe, observe_foot
 from cuspid.geometry import Rigid3
 from cuspid.runtime.kernels import kernel
-from cuspid.runtime.workers import in_shares
+from cuspid.runtime.workers import run_in_shares
 
 BLOCK = 8
 """Voxels along the side of a block."""
@@ -41,18 +41,29 @@ def unpack(keys: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n 3"]:
     return np.stack([keys >> 42, (keys >> 21) & _MASK, keys & _MASK], axis=-1) - _OFFSET
 
 
-@dataclass(frozen=True, eq=False)
-class VolumeUpdate:
-    """A depth map, and the blocks of the volume that it reaches."""
+class VolumeUpdate(NamedTuple):
+    """A depth map, and the blocks of the volume that it reaches, for a kernel."""
 
     evidence: Evidence
     """What it says."""
-    cam_from_world: Rigid3
-    """Where its camera was."""
+    rotation: Float[np.ndarray, "3 3"]
+    """Of ``cam_from_world``, as ``translation``."""
+    translation: Float[np.ndarray, "3"]
     keys: Int[np.ndarray, "b"]
     """Keys of the blocks around its points, sorted."""
     nearest: Int[np.ndarray, "h w"]
     """As :meth:`Evidence.nearest` within the truncation distance."""
+
+
+class _Volume(NamedTuple):
+    """A :class:`SparseVolume` for a kernel, and how depth maps are blended into it."""
+
+    distance: np.ndarray
+    weight: np.ndarray
+    voxel: float
+    truncation: float
+    sign: float
+    """-1 to take them out again."""
 
 
 @dataclass
@@ -79,31 +90,20 @@ class SparseVolume:
     ) -> VolumeUpdate:
         """The blocks that a depth map with these points (world, mm) will change, whatever was blended before."""
         nearest = evidence.nearest(self._reach_px(evidence, cam_from_world, points))
-        return VolumeUpdate(evidence, cam_from_world, self._keys_around(points), nearest)
+        keys = self._keys_around(points)
+        return VolumeUpdate(evidence, cam_from_world.rotation, cam_from_world.translation, keys, nearest)
 
     def integrate(self, maps: Sequence[VolumeUpdate], *, take_out: bool = False) -> None:
         """Blend depth maps into the volume, one after the other, or take out again what was blended so."""
         slots = [self._allocate(one.keys) for one in maps]
+        sign = -1.0 if take_out else 1.0
+        volume = _Volume(self.distance, self.weight, self.voxel_mm, self.truncation_mm, sign)
 
         def work(share: int, shares: int) -> None:
             for one, blocks in zip(maps, slots, strict=True):
-                _integrate(
-                    self.distance,
-                    self.weight,
-                    blocks,
-                    one.keys,
-                    share,
-                    shares,
-                    self.voxel_mm,
-                    one.cam_from_world.rotation,
-                    one.cam_from_world.translation,
-                    *one.evidence.arrays,
-                    one.nearest,
-                    self.truncation_mm,
-                    -1.0 if take_out else 1.0,
-                )
+                _integrate(one, blocks, volume, share, shares)
 
-        in_shares(work)
+        run_in_shares(work)
 
     def _reach_px(self, evidence: Evidence, cam_from_world: Rigid3, points: Float[np.ndarray, "n 3"]) -> int:
         """How many pixels the truncation distance takes at most, seen from the camera."""
@@ -138,14 +138,14 @@ def neighbour_keys(keys: Int[np.ndarray, "b"]) -> Int[np.ndarray, "b 27"]:
     return pack(unpack(keys)[:, None] + (np.array(list(np.ndindex(3, 3, 3))) - 1))
 
 
-def find(keys: Int[np.ndarray, "b"], wanted: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+def find(keys: Int[np.ndarray, "b"], queries: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
     """Where each of the wanted keys stands among others, -1 where it does not."""
     if len(keys) == 0:
-        return np.full(wanted.shape, -1)
+        return np.full(queries.shape, -1)
     order = np.argsort(keys)
     ranked = keys[order]
-    place = np.searchsorted(ranked, wanted).clip(0, len(keys) - 1)
-    return np.where(ranked[place] == wanted, order[place], -1)
+    place = np.searchsorted(ranked, queries).clip(0, len(keys) - 1)
+    return np.where(ranked[place] == queries, order[place], -1)
 
 
 def _grow_array(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray, "r v"]:
@@ -156,25 +156,10 @@ def _grow_array(array: Float[np.ndarray, "b v"], room: int) -> Float[np.ndarray,
 
 @kernel
 @no_type_check
-def _integrate(
-    distance,
-    weight,
-    slots,
-    keys,
-    share,
-    shares,
-    voxel,
-    rotation,
-    translation,
-    plane,
-    known,
-    intrinsics,
-    nearest,
-    truncation,
-    sign,
-):
-    """Running weighted mean of the signed distance in each voxel of a share of the blocks; with a sign of -1, without
-    this one."""
+def _integrate(update, slots, volume, share, shares):
+    """Running weighted mean of the signed distance in each voxel of a share of the blocks."""
+    evidence, rotation, translation, keys, nearest = update
+    distance, weight, voxel, truncation, sign = volume
     seen = np.zeros(6)
     for n in range(slots.size):
         if slots[n] % shares != share:
@@ -192,10 +177,10 @@ def _integrate(
                         continue
                     right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
                     down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
-                    if observe(plane, known, intrinsics, right, down, depth, seen):
+                    if observe(evidence, right, down, depth, seen):
                         if seen[0] < -truncation:
                             continue
-                    elif not observe_foot(plane, known, intrinsics, nearest, truncation, right, down, depth, seen):
+                    elif not observe_foot(evidence, nearest, truncation, right, down, depth, seen):
                         continue
                     voxel_index = (i * 8 + j) * 8 + k
                     new = sign * seen[1]

@@ -28,7 +28,7 @@ def coat(nl, nv, nh, vh, reflectance, roughness):
 
 @kernel(fastmath=True)
 @no_type_check
-def leaving(cosine, index):
+def transmittance(cosine, index):
     """Share of scattered light that leaves a body of a refractive index at an angle to the normal, relative to that
     along it (Fresnel's equations, unpolarised light)."""
     cosine = min(max(cosine, 0.0), 1.0)

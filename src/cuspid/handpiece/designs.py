@@ -71,7 +71,7 @@ class DesignOptions(Options):
 
 
 def stereo_pair(options: DesignOptions = DesignOptions()) -> Handpiece:
-    """Of the essential four those two that lie across the arch, with the same lights."""
+    """The two cameras of the essential four that lie across the arch, with the same lights."""
     four = _four(options)
     pair = replace(four, rig=Rig({name: four.rig[name] for name in ("o1", "o2")}), name="stereo-pair")
     return with_holder(pair, options.holder)
@@ -98,8 +98,8 @@ def six_cameras(options: DesignOptions = DesignOptions()) -> Handpiece:
     cameras = {f"o{5 + k}": _outer_camera(options, side) for k, side in enumerate((+1, -1))}
     six = replace(four, rig=Rig({**four.rig.cameras, **cameras}), name="six-cameras")
     if options.lights == "white":
-        lights = {**four.lights, **_outer_lights(options)}
-        six = replace(six, lights=lights, lightings=_together(lights))
+        lights = {**four.lights, **{f"o{5 + k}": _outer_light(options, side) for k, side in enumerate((+1, -1))}}
+        six = replace(six, lights=lights, lightings=_single_lighting(lights))
     return with_holder(six, options.holder)
 
 
@@ -138,7 +138,7 @@ def _handpiece(name: str, views: Mapping[str, Rigid3], options: DesignOptions) -
 
 
 def _occlusal_view(options: DesignOptions) -> Rigid3:
-    return looking_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), options.working_distance_mm)
+    return look_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), options.working_distance_mm)
 
 
 def _side_view(options: DesignOptions, side: int) -> Rigid3:
@@ -146,7 +146,7 @@ def _side_view(options: DesignOptions, side: int) -> Rigid3:
     tilt = np.deg2rad(options.side_tilt_deg)
     target = np.array([0, side * options.side_offset_mm, -options.side_depth_mm])
     axis = np.array([0, -side * np.sin(tilt), -np.cos(tilt)])
-    return looking_at(target, axis, np.array([-side, 0.0, 0.0]), options.working_distance_mm)
+    return look_at(target, axis, np.array([-side, 0.0, 0.0]), options.working_distance_mm)
 
 
 def _outer_camera(options: DesignOptions, side: int) -> MountedCamera:
@@ -154,11 +154,7 @@ def _outer_camera(options: DesignOptions, side: int) -> MountedCamera:
     axis = np.array([0, -side * np.sin(tilt), -np.cos(tilt)])
     centre = np.array([0, side * _outer_place_mm(options), options.working_distance_mm])
     camera = Camera.from_field_of_view(options.width_px, options.height_px, options.field_of_view_deg)
-    return MountedCamera(camera, looking_at(centre, axis, np.array([1.0, 0, 0]), 0.0))
-
-
-def _outer_lights(options: DesignOptions) -> dict[str, Light]:
-    return {f"o{5 + k}": _outer_light(options, side) for k, side in enumerate((+1, -1))}
+    return MountedCamera(camera, look_at(centre, axis, np.array([1.0, 0, 0]), 0.0))
 
 
 def _outer_light(options: DesignOptions, side: int) -> Light:
@@ -173,7 +169,7 @@ def _outer_place_mm(options: DesignOptions) -> float:
     return options.baseline_across_mm / 2 + options.outer_distance_mm
 
 
-def looking_at(
+def look_at(
     target: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], right: Float[np.ndarray, "3"], distance_mm: float
 ) -> Rigid3:
     """``view_from_rig`` of a view along ``axis`` onto a point, with ``right`` to the right of the image."""
@@ -195,16 +191,16 @@ def _add_leds(views: Mapping[str, Rigid3], options: DesignOptions) -> tuple[dict
     """The LEDs about all groups, and which of them are on together."""
     if options.lights == "white":
         white = {name: light for view in views.items() for name, light in _group_lights(*view, options).items()}
-        return white, _together(white)
+        return white, _single_lighting(white)
     in_turn = options.lights == "in-turn"
     first = _coded_lights(views, options, glare=1.0 if in_turn else _CROSSED)
     if not in_turn:
-        return first, _together(first)
+        return first, _single_lighting(first)
     second = _coded_lights(views, options, glare=1.0, turned_deg=_BETWEEN_DEG, suffix="2")
     return first | second, (Lighting(name="first", lights=tuple(first)), Lighting(name="second", lights=tuple(second)))
 
 
-def _together(lights: Mapping[str, Light]) -> tuple[Lighting, ...]:
+def _single_lighting(lights: Mapping[str, Light]) -> tuple[Lighting, ...]:
     return (Lighting(name="all", lights=tuple(lights)),)
 
 

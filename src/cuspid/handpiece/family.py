@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.geometry import Rigid3
-from cuspid.handpiece.designs import looking_at
+from cuspid.handpiece.designs import look_at
 from cuspid.handpiece.optics import Optics
 from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 
@@ -150,17 +150,17 @@ def _light(group_from_rig: Rigid3, x_mm: float, y_mm: float) -> Light:
 
 
 def _occlusal_view(shape: Shape) -> Rigid3:
-    return looking_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), shape.distance_mm)
+    return look_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), shape.distance_mm)
 
 
 def _side_view(shape: Shape, side: int) -> Rigid3:
     target = np.array([0, side * shape.side_offset_mm, -shape.side_depth_mm])
-    return looking_at(target, _inwards(shape.side_tilt_deg, side), np.array([-side, 0.0, 0.0]), shape.distance_mm)
+    return look_at(target, _inwards(shape.side_tilt_deg, side), np.array([-side, 0.0, 0.0]), shape.distance_mm)
 
 
 def _outer_view(layout: Layout, shape: Shape, side: int) -> Rigid3:
     centre = np.array([0, side * _reach(layout, shape), shape.distance_mm])
-    return looking_at(centre, _inwards(shape.outer_tilt_deg, side), np.array([1.0, 0, 0]), 0.0)
+    return look_at(centre, _inwards(shape.outer_tilt_deg, side), np.array([1.0, 0, 0]), 0.0)
 
 
 def _inwards(tilt_deg: float, side: int) -> Float[np.ndarray, "3"]:

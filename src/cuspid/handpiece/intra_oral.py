@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from cuspid.handpiece.cad.holder import HolderOptions, with_holder
-from cuspid.handpiece.designs import looking_at
+from cuspid.handpiece.designs import look_at
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Handpiece, Light, Lighting, MountedCamera, Rig
 from cuspid.runtime.options import Options, Range
@@ -75,5 +75,5 @@ def _cameras(options: IntraOralOptions) -> dict[str, MountedCamera]:
         eye = np.array([place * options.baseline_mm, 0, options.working_distance_mm])
         axis = -eye / np.linalg.norm(eye)
         right = np.array([-axis[2], 0, axis[0]])
-        mounted[name] = MountedCamera(camera, looking_at(np.zeros(3), axis, right, float(np.linalg.norm(eye))))
+        mounted[name] = MountedCamera(camera, look_at(np.zeros(3), axis, right, float(np.linalg.norm(eye))))
     return mounted

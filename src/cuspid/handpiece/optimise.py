@@ -117,12 +117,12 @@ class Condition:
 
     @property
     def shortfall(self) -> float:
-        """By which part of the limit it is missed, 0 or more."""
+        """Shortfall as a share of the limit; 0 if the condition is met."""
         missing = self.wanted - self.reached if self.at_least else self.reached - self.wanted
         return max(0.0, missing) / max(abs(self.wanted), 1e-6)
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.reached:.3g}, wanted {'>=' if self.at_least else '<='} {self.wanted:.3g}"
+        return f"{self.name}: {self.reached:.3g}, required {'>=' if self.at_least else '<='} {self.wanted:.3g}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,8 +334,8 @@ def assess_handpiece(
     shares = {name: seen_mm2[name] / area_mm2[name] for name in area_mm2}
     bound_by_name = {name: float(np.mean(values)) if values else float("nan") for name, values in bounds.items()}
     unseen = float(np.mean([1 - shares[name] for name in brief.surfaces]))
-    wanted = [value for name in brief.surfaces for value in bounds[name]]
-    mean_bound = float(np.mean(wanted)) if wanted else 1000.0
+    bounds_um = [value for name in brief.surfaces for value in bounds[name]]
+    mean_bound = float(np.mean(bounds_um)) if bounds_um else 1000.0
     conditions = tuple(
         [
             Condition(name=f"share of {name}", wanted=w, reached=shares[name], at_least=True)
@@ -394,10 +394,10 @@ def _height_and_clearance(handpiece: Handpiece, brief: DesignBrief, section: Sec
     tooth = np.any(list(section.surfaces.values()), axis=0)
     top = section.mesh.face_centres[tooth, 2].max()
     height = max(float(pose.inverse().apply(corners)[:, 2].max()) for pose in section.rig_from_world) - top
-    wanted = brief.mouth.clearance_mm
-    room = Room(section.mesh, handpiece.solid, wanted)
+    required_mm = brief.mouth.clearance_mm
+    room = Room(section.mesh, handpiece.solid, required_mm)
     nearest = min(room.clearance(pose)[0] for pose in section.rig_from_world)
-    return float(height), float(np.clip(nearest, -_REACH_MM, wanted + FAR_MM))
+    return float(height), float(np.clip(nearest, -_REACH_MM, required_mm + FAR_MM))
 
 
 def _survey(
@@ -406,8 +406,8 @@ def _survey(
     """Whether each face is seen; some faces, and the bound there (NaN where unseen)."""
     rig, mesh = handpiece.rig, section.mesh
     paired = _pair_cameras(handpiece, options.pairing)
-    wanted = np.flatnonzero(np.any(list(section.surfaces.values()), axis=0))
-    places = wanted[np.linspace(0, len(wanted) - 1, min(options.points, len(wanted))).astype(int)]
+    faces = np.flatnonzero(np.any(list(section.surfaces.values()), axis=0))
+    places = faces[np.linspace(0, len(faces) - 1, min(options.points, len(faces))).astype(int)]
     found, best = np.zeros(len(mesh.faces), dtype=bool), np.full(len(places), np.inf)
     for pose in section.rig_from_world:
         sees = np.zeros((len(rig.names), len(mesh.faces)), dtype=bool)

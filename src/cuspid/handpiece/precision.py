@@ -91,7 +91,7 @@ def convergence(
     rays = np.stack([points - mounted.centre_in_rig for mounted in cameras])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     cosines = np.einsum("ank,bnk->abn", rays, rays)
-    return _of_nearest(np.arccos(np.clip(cosines, -1.0, 1.0)), seen)
+    return _min_over_partners(np.arccos(np.clip(cosines, -1.0, 1.0)), seen)
 
 
 def deformation(
@@ -115,10 +115,10 @@ def deformation(
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         between = _largest_singular_value(difference @ adjugate) / np.abs(determinant)
-    return _of_nearest(np.where(np.isnan(between), np.inf, between), seen)
+    return _min_over_partners(np.where(np.isnan(between), np.inf, between), seen)
 
 
-def _of_nearest(between: Float[np.ndarray, "c c n"], seen: Bool[np.ndarray, "c n"]) -> Float[np.ndarray, "c n"]:
+def _min_over_partners(between: Float[np.ndarray, "c c n"], seen: Bool[np.ndarray, "c n"]) -> Float[np.ndarray, "c n"]:
     """For each camera that sees a point the smallest value to another one that does."""
     partners = seen[:, None] & seen[None] & ~np.eye(len(seen), dtype=bool)[..., None]
     smallest = np.where(partners, between, np.inf).min(axis=1)
@@ -229,8 +229,8 @@ def precision_map(
     return PrecisionMap(cameras_at_once=seen.sum(axis=0), covariance=covariance)
 
 
-def at_best(maps: Sequence[PrecisionMap]) -> PrecisionMap:
-    """Of several positions the one that is best for each face, by the trace of the bound."""
+def best_of_positions(maps: Sequence[PrecisionMap]) -> PrecisionMap:
+    """The best of several positions for each face, by the trace of the bound."""
     covariances = np.array([each.covariance for each in maps])
     traces = np.nan_to_num(np.trace(covariances, axis1=2, axis2=3), nan=np.inf)
     best, faces = traces.argmin(axis=0), np.arange(traces.shape[1])

@@ -14,7 +14,8 @@ from types import MappingProxyType
 
 from cuspid.handpiece.optics import Optics, horizontal_from_diagonal_deg
 
-_FOCUS_ASSUMED = "Inferred: focus 5 mm, the working distance of the thesis (assumed; the maker was not found to tell)."
+_FOCUS_ASSUMED = "Inferred: focus 5 mm, the working distance of the thesis (assumed; no statement of the maker was "
+"found)."
 _ZYNQ = "perceptive-ic.com, 'Endoscope scheme based on ZYNQ FPGA and SoC'"
 
 

@@ -106,7 +106,8 @@ def _rough_curves(crowns: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
     # Angles grow clockwise and are zero at the middle of the arch, so that the cut lies behind the mouth.
     angle = -np.angle(np.exp(1j * (np.arctan2(offset[:, 1], offset[:, 0]) - middle)))
     straight = _straight_curve(crowns, centre)
-    if np.ptp(np.percentile(angle, [1, 99])) < np.deg2rad(_ARC_DEG) or _is_short(crowns):
+    is_short = np.ptp(crowns[:, :2], axis=0).max() < _SHORT_MM  # any circle may go through two or three teeth
+    if is_short or np.ptp(np.percentile(angle, [1, 99])) < np.deg2rad(_ARC_DEG):
         return (straight,)
     radius = np.linalg.norm(offset, axis=1)
     along = angle * np.median(radius)
@@ -115,11 +116,6 @@ def _rough_curves(crowns: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
     turn = middle - fine / np.median(radius)
     bent = np.column_stack([centre + smooth[:, :1] * np.stack([np.cos(turn), np.sin(turn)], axis=1), smooth[:, 1]])
     return bent, straight
-
-
-def _is_short(crowns: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether these are the crowns of two or three teeth at most, through which any circle may go."""
-    return bool(np.ptp(crowns[:, :2], axis=0).max() < _SHORT_MM)
 
 
 def _straight_curve(crowns: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, "2"]) -> Float[np.ndarray, "m 3"]:

@@ -252,7 +252,7 @@ class Capture(Displayed):
         return {name: mask for name, mask in masks.items() if mask is not None}
 
     def check_image(self, frame: Frame, camera: str) -> None:
-        """Raise what :meth:`image` would, as far as can be told without decoding the image."""
+        """Raise what :meth:`image` would, as far as possible without decoding the image."""
         model = self.handpiece.rig[camera].camera
         width, height = self.source.size(frame.name, camera)
         if (width, height) != (model.width, model.height):

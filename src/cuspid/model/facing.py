@@ -1,7 +1,7 @@
 """Which way the faces of a mesh look: files come with faces that look inwards, some of them or all.
 
 Neighbours whose shared edge runs the same way in both look to different sides; each piece is made to look to one side,
-that of most of its area. Which side is outside is told by rays: from the outside of a surface most directions are free,
+that of most of its area. Rays decide which side is outside: from the outside of a surface most directions are free,
 from its inside (of a closed one) none, and under the crowns of an open scan few. A piece is turned only if its front
 sees less than half of the directions, and clearly less than its back: a hollow, seen from inside, is left as it is.
 """
@@ -40,7 +40,7 @@ _GRAZING = 0.1
 def facing_outwards(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
     """The mesh with faces that look inwards turned, and notes on that; the mesh itself where none does."""
     one, other, against = _neighbours(mesh)
-    uneven, pieces = _uneven(mesh, one, other, against)
+    uneven, pieces = _inconsistent_faces(mesh, one, other, against)
     even = _flip_faces(mesh, uneven)
     turned = uneven ^ _inwards(even, pieces)
     left = float(np.mean((against ^ turned[one] ^ turned[other]) if len(one) else 0.0))
@@ -80,7 +80,7 @@ def _neighbours(mesh: Mesh) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"],
     return first // 3, second // 3, edges[first, 0] == edges[second, 0]
 
 
-def _uneven(
+def _inconsistent_faces(
     mesh: Mesh, one: Int[np.ndarray, "e"], other: Int[np.ndarray, "e"], against: Bool[np.ndarray, "e"]
 ) -> tuple[Bool[np.ndarray, "f"], Int[np.ndarray, "f"]]:
     """The faces that look to the other side than most of their piece does, and the number of the piece of each face.
@@ -114,7 +114,7 @@ def _inwards(mesh: Mesh, piece: Int[np.ndarray, "f"]) -> Bool[np.ndarray, "f"]:
     rest, if nearly all of that is turned."""
     count = int(piece.max()) + 1
     faces, ahead, behind = _openness(mesh)
-    known, ahead, behind = _of_pieces(piece[faces], ahead, behind, count)
+    known, ahead, behind = _piece_means(piece[faces], ahead, behind, count)
     inwards = known & _is_inside(ahead, behind)
     for each in np.flatnonzero(inwards):
         _, alone, back = _openness(mesh.submesh(piece == each))
@@ -131,7 +131,7 @@ def _is_inside(front: _Share, back: _Share) -> _Share:
     return (front < _HIDDEN) & (back > front + _CLEARLY)
 
 
-def _of_pieces(
+def _piece_means(
     owners: Int[np.ndarray, "n"], front: Float[np.ndarray, "n"], back: Float[np.ndarray, "n"], count: int
 ) -> tuple[Bool[np.ndarray, "p"], Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
     """Which pieces have enough samples, and the means of theirs."""

@@ -49,7 +49,7 @@ def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 
 
 def used_vertices(faces: Int[np.ndarray, "f 3"], count: int) -> Int[np.ndarray, "u"]:
-    """Those of ``count`` vertices that the faces use, in ascending order."""
+    """Indices, in ascending order, of the vertices that the faces use, out of ``count``."""
     return np.flatnonzero(np.bincount(faces.ravel(), minlength=count))
 
 
@@ -69,7 +69,7 @@ def _face_cross(vertices, faces):
 
 @kernel
 @no_type_check
-def _summed_at_vertices(faces, vectors, count):
+def _sum_at_vertices(faces, vectors, count):
     """The sum of the vectors of the faces around each vertex."""
     summed = np.zeros((count, 3))
     for i in range(len(faces)):
@@ -81,7 +81,7 @@ def _summed_at_vertices(faces, vectors, count):
 
 @kernel
 @no_type_check
-def _in_double(faces, lengths, u, v):
+def _widen_hits(faces, lengths, u, v):
     """What Embree tells of first hits, as :class:`RayHits` has it."""
     count = len(faces)
     wide, distances, barycentric = np.empty(count, np.int64), np.empty(count), np.empty((count, 3))
@@ -173,7 +173,7 @@ class Mesh(Viewable):
     @computed_once
     def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
         """Unit normals, the area-weighted mean of the adjoining faces."""
-        summed = _summed_at_vertices(self.faces, self.face_cross, len(self.vertices))
+        summed = _sum_at_vertices(self.faces, self.face_cross, len(self.vertices))
         norms = np.linalg.norm(summed, axis=1, keepdims=True)
         return freeze(summed / np.where(norms > 0, norms, 1))
 
@@ -229,7 +229,7 @@ class Mesh(Viewable):
             dists=np.full(len(origins), farthest, dtype=np.float32),
             output=True,
         )
-        return RayHits(*_in_double(hits["primID"], hits["tfar"], hits["u"], hits["v"]))
+        return RayHits(*_widen_hits(hits["primID"], hits["tfar"], hits["u"], hits["v"]))
 
     def cast_on_all_cores(
         self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], farthest: float = np.inf

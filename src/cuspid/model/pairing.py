@@ -52,12 +52,12 @@ class PairingOptions(Options):
     max_sources: Annotated[int, Range(1, 100)] = 6
     """Each view is matched with no more than this many others, the best ones."""
     min_share: Annotated[float, SHARE] = 0.15
-    """A view is not matched with those that are worth less than this share (0 to 1) of the best one: 20 degrees apart
-    is best, 33 degrees are worth 0.7 of it, 40 degrees 0.4 and 50 degrees 0.1."""
+    """A view is not matched with those whose weight is less than this share (0 to 1) of the best one's: 20 degrees
+    apart is best, 33 degrees have 0.7 of that weight, 40 degrees 0.4 and 50 degrees 0.1."""
 
 
-def worth_of_angle(angle_deg: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """What a source is worth (0 to 1) for lines of sight that meet at an angle: a soft choice of 8 to 20 degrees."""
+def angle_weight(angle_deg: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Weight (0 to 1) of a source whose lines of sight meet at an angle: a soft choice of 8 to 20 degrees."""
     least, most = _BEST_DEG
     fall = np.exp(-0.5 * (np.maximum(angle_deg - most, 0) / _FALL_DEG) ** 2)
     return np.asarray(np.minimum(angle_deg / least, 1) * fall)
@@ -67,16 +67,16 @@ def rank_sources(
     rig: Rig, distance_mm: float, options: PairingOptions = PairingOptions()
 ) -> Mapping[str, tuple[str, ...]]:
     """For each camera the others that it is matched with, best first, for a surface at the given distance."""
-    names, worth = rig.names, np.zeros((len(rig.names),) * 2)
+    names, weights = rig.names, np.zeros((len(rig.names),) * 2)
     for one, other in combinations(range(len(names)), 2):
         pair = names[one], names[other]
         if rig.angle_deg(*pair) > options.max_angle_deg + _ROUNDING_DEG:
             continue
-        shared = _shared_view(rig, pair, distance_mm)
+        shared = _view_overlap(rig, pair, distance_mm)
         if shared >= options.min_overlap:
             angles = np.array([rig.meeting_deg(*pair, distance_mm), rig.meeting_deg(*pair[::-1], distance_mm)])
-            worth[one, other], worth[other, one] = shared * worth_of_angle(angles)
-    return {name: tuple(names[k] for k in _best(row, options)) for name, row in zip(names, worth, strict=True)}
+            weights[one, other], weights[other, one] = shared * angle_weight(angles)
+    return {name: tuple(names[k] for k in _best(row, options)) for name, row in zip(names, weights, strict=True)}
 
 
 def rank_by_points(
@@ -93,7 +93,7 @@ def rank_by_points(
     sees[sightings[:, 0], sightings[:, 1]] = True
     ranked = []
     for reference in range(len(centres)):
-        worth = np.zeros(len(centres))
+        weights = np.zeros(len(centres))
         mine = np.flatnonzero(sees[reference])
         towards = unit(centres[reference] - points[mine])
         for other in np.flatnonzero(sees[:, mine].sum(axis=1) >= _LEAST_SHARED) if len(mine) else ():
@@ -102,17 +102,17 @@ def rank_by_points(
             angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
             # The median angle, since most points of a view are seen again at its best side only.
             enough = min(1.0, np.sqrt(both.sum() / min(_SHARED_ENOUGH, len(mine))))
-            worth[other] = enough * worth_of_angle(np.array(np.median(angle_deg)))
-        worth[reference] = 0
-        ranked.append(_best(worth, options))
+            weights[other] = enough * angle_weight(np.array(np.median(angle_deg)))
+        weights[reference] = 0
+        ranked.append(_best(weights, options))
     return tuple(ranked)
 
 
-def _best(worth: Float[np.ndarray, "v"], options: PairingOptions) -> tuple[int, ...]:
+def _best(weights: Float[np.ndarray, "v"], options: PairingOptions) -> tuple[int, ...]:
     """Indices of the views that are worth enough, best first."""
-    order = np.argsort(-worth, kind="stable")[: options.max_sources]
-    least = max(options.min_share * worth.max(initial=0.0), _LEAST_WORTH)
-    return tuple(int(k) for k in order if worth[k] >= least)
+    order = np.argsort(-weights, kind="stable")[: options.max_sources]
+    least = max(options.min_share * weights.max(initial=0.0), _LEAST_WORTH)
+    return tuple(int(k) for k in order if weights[k] >= least)
 
 
 def stereo_pairs(
@@ -147,17 +147,19 @@ def guess_working_distance_mm(rig: Rig) -> tuple[float, str]:
     limit_deg = PairingOptions.max_angle_deg
     pairs = [pair for pair in combinations(rig.names, 2) if rig.angle_deg(*pair) <= limit_deg]
     if not pairs:
-        raise InputError("the working distance cannot be told from the cameras: no two of them look the same way")
+        raise InputError("the working distance cannot be inferred from the cameras: no two of them look the same way")
     if min(rig.angle_deg(*pair) for pair in pairs) >= _CONVERGING_DEG:
-        distance_mm, source = float(np.median([_meeting_mm(rig, *pair) for pair in pairs])), "where their axes meet"
+        distance_mm, source = float(np.median([_axes_meet_mm(rig, *pair) for pair in pairs])), "where their axes meet"
     else:
-        distance_mm, source = _sharing_mm(rig, pairs), "their baselines"
+        distance_mm, source = _least_shared_distance_mm(rig, pairs), "their baselines"
     if not 0 < distance_mm < np.inf:
-        raise InputError("the working distance cannot be told from the cameras: no two of them look at the same place")
+        raise InputError(
+            "the working distance cannot be inferred from the cameras: no two of them look at the same place"
+        )
     return distance_mm, source
 
 
-def _meeting_mm(rig: Rig, first: str, second: str) -> float:
+def _axes_meet_mm(rig: Rig, first: str, second: str) -> float:
     """How far in front of two cameras their axes come nearest to each other, on average; negative behind them."""
     one, other = rig[first], rig[second]
     axes = np.stack([one.axis_in_rig, -other.axis_in_rig], axis=1)
@@ -165,12 +167,12 @@ def _meeting_mm(rig: Rig, first: str, second: str) -> float:
     return float(along.mean())
 
 
-def _sharing_mm(rig: Rig, pairs: Sequence[tuple[str, str]]) -> float:
+def _least_shared_distance_mm(rig: Rig, pairs: Sequence[tuple[str, str]]) -> float:
     """From what distance on a camera shares enough of what it sees with its best partner; infinite if from none on."""
     paired = [name for name in rig.names if any(name in pair for pair in pairs)]
 
     def usual_share(distance_mm: float) -> float:
-        shares = {pair: _shared_view(rig, pair, distance_mm) for pair in pairs}
+        shares = {pair: _view_overlap(rig, pair, distance_mm) for pair in pairs}
         return float(np.median([max(share for pair, share in shares.items() if name in pair) for name in paired]))
 
     baselines = [float(np.linalg.norm(rig[one].centre_in_rig - rig[other].centre_in_rig)) for one, other in pairs]
@@ -178,7 +180,7 @@ def _sharing_mm(rig: Rig, pairs: Sequence[tuple[str, str]]) -> float:
     return float(distances[bisect_left(distances[:-1].tolist(), _SHARED, key=usual_share)])
 
 
-def _shared_view(rig: Rig, pair: tuple[str, str], distance_mm: float) -> float:
+def _view_overlap(rig: Rig, pair: tuple[str, str], distance_mm: float) -> float:
     """What either camera of a pair sees at a distance that the other sees, too (0 to 1)."""
     first, second = pair
     return min(rig.overlap(first, second, distance_mm), rig.overlap(second, first, distance_mm))

@@ -115,7 +115,7 @@ class PhotoCamera:
     size: tuple[int, int]
     """Width and height of its photographs, px."""
     focal_px: float | None = None
-    """Focal length by EXIF; None where it is not told."""
+    """Focal length by EXIF; None where it is unknown."""
     calibrated: Camera | None = None
     """Calibration; None if it is to be found from the photographs."""
 

@@ -72,7 +72,7 @@ class Funnel:
 
 
 def sum_funnels(funnels: Iterable[Funnel | None]) -> Funnel | None:
-    """Of several depth maps; None if none of them has one."""
+    """Sum of the funnels of several depth maps; None if none of them has one."""
     known = [funnel for funnel in funnels if funnel is not None]
     return reduce(add, known) if known else None
 
@@ -152,14 +152,14 @@ class Tracks:
     """For each observation: the place, in px of the (distorted) image."""
 
 
-def joined_tracks(first: Tracks, second: Tracks) -> Tracks:
+def concatenate_tracks(first: Tracks, second: Tracks) -> Tracks:
     """The points and observations of both."""
     joined = {each.name: np.concatenate([getattr(t, each.name) for t in (first, second)]) for each in fields(Tracks)}
     joined["point_index"][len(first.point_index) :] += len(first.points)
     return Tracks(**joined)
 
 
-def chosen_tracks(tracks: Tracks, which: Bool[np.ndarray, "o"]) -> Tracks:
+def select_tracks(tracks: Tracks, which: Bool[np.ndarray, "o"]) -> Tracks:
     """Some of the observations, and the points that are seen in them."""
     kept, number = np.unique(tracks.point_index[which], return_inverse=True)
     return Tracks(
@@ -255,8 +255,8 @@ class Reconstruction:
     reprojection_rms_px: float | None = None
     """RMS reprojection error of the sparse model."""
     has_scale: bool = True
-    """False where nothing tells how large things are, as for the photographs of one camera: lengths are then in an
-    arbitrary unit, whatever the names of the fields say."""
+    """False where the scale is unknown, as for the photographs of one camera: lengths are then in an arbitrary unit,
+    whatever the names of the fields say."""
     log: Mapping[str, float | int] = field(default_factory=dict)
     """Counts, and durations of the stages in seconds; units are in the keys."""
     notes: tuple[str, ...] = ()
@@ -277,7 +277,7 @@ class Reconstruction:
 
     @property
     def told_by(self) -> str:
-        """What ``expectation`` follows from: surfaces, unlike tracks, tell nothing of the calibration."""
+        """What ``expectation`` follows from: surfaces, unlike tracks, say nothing about the calibration."""
         return "poses alone" if self.tracks is None else "poses and calibration"
 
     def with_cameras_as(self, names: Sequence[str]) -> Reconstruction:

@@ -376,7 +376,7 @@ class Handpiece(Viewable):
 
     @property
     def only_lighting(self) -> str | None:
-        """The lighting pattern of frames of which nothing is told; None where there are several, or none."""
+        """The lighting pattern of frames that state none; None where there are several, or none."""
         return self.lightings[0].name if len(self.lightings) == 1 else None
 
     def lights_on(self, lighting: str | None) -> list[Light]:

@@ -147,7 +147,7 @@ class Room:
         self, rig_from_world: Rigid3, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
     ) -> Float[np.ndarray, "n 3"]:
         """Points of the surface in a box of the rig frame."""
-        return np.asarray(_in_box(self._points, rig_from_world.rotation, rig_from_world.translation, low, high))
+        return np.asarray(_points_in_box(self._points, rig_from_world.rotation, rig_from_world.translation, low, high))
 
     @property
     def _points(self) -> Float[np.ndarray, "n 3"]:
@@ -250,7 +250,7 @@ def check_clearance(room: Room, poses: Mapping[str, Rigid3]) -> None:
 
 @kernel
 @no_type_check
-def _in_box(points, r, t, low, high):
+def _points_in_box(points, r, t, low, high):
     """The points, moved, that then lie in a box."""
     found = np.empty((len(points), 3))
     count = 0
@@ -348,7 +348,7 @@ def _box_distance(x, y, z, bounds):
 
 @kernel
 @no_type_check
-def _at_least(x, y, z, solid):
+def _distance_bound(x, y, z, solid):
     """A lower bound of the distance from a place in the rig frame to the body: near to it twice `_OFF` spacings below
     an upper bound."""
     nx, ny, nz = solid.distances.shape
@@ -372,7 +372,7 @@ def _is_free(rotation, translation, surface, solid, limit, stack):
         count -= 1
         ball = stack[count]
         x, y, z = _transform_point(rotation, translation, surface.centres[ball])
-        if _at_least(x, y, z, solid) - surface.radii[ball] >= limit:
+        if _distance_bound(x, y, z, solid) - surface.radii[ball] >= limit:
             continue
         if ball < leaves - 1:
             stack[count], stack[count + 1] = 2 * ball + 1, 2 * ball + 2
@@ -381,7 +381,7 @@ def _is_free(rotation, translation, surface, solid, limit, stack):
         first = (ball - leaves + 1) * leaf
         for n in range(first, first + leaf):
             x, y, z = _transform_point(rotation, translation, surface.points[n])
-            least = _at_least(x, y, z, solid)
+            least = _distance_bound(x, y, z, solid)
             if least >= limit:
                 continue
             undecided = least + 2 * _OFF * solid.pitch >= limit

@@ -47,7 +47,7 @@ class Shutter:
         return not (self.delay_sigma_frames or self.readout_sigma)
 
     def later(self, delay_frames: float, readout: float) -> Shutter:
-        """With a delay and a readout that are longer by so much."""
+        """The shutter with its delay and readout increased by so much."""
         return replace(self, delay_frames=self.delay_frames + delay_frames, readout=self.readout + readout)
 
     def late(self, heights: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -71,15 +71,16 @@ def frame_numbers(names: Iterable[str]) -> dict[str, int] | None:
 
 
 def film_times(names: Sequence[str]) -> tuple[float, ...] | None:
-    """When the frames of a film were taken, in frames; None where their names do not tell, or not in order."""
+    """When the frames of a film were taken, in frames; None where their names do not give them, or they are not in
+    order."""
     number = frame_numbers(names)
     times = () if number is None else tuple(map(float, number.values()))
     return times if len(times) > 1 and all(before < after for before, after in pairwise(times)) else None
 
 
 def motions(poses: Sequence[Rigid3], times: Sequence[float] | None) -> Float[np.ndarray, "f 6"]:
-    """How the handpiece moves in a frame at each pose, given their times in order; 0 where no neighbour is near enough
-    to tell, and everywhere without times."""
+    """How the handpiece moves in a frame at each pose, given their times in order; 0 where no neighbour is near enough,
+    and everywhere without times."""
     found = np.zeros((len(poses), 6))
     if times is None:
         return found

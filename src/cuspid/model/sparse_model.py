@@ -1,4 +1,4 @@
-"""What one camera tells about its trajectory and the surface: without scale, hence a model in its own units of length.
+"""The trajectory and the surface as one camera reveals them: without scale, hence a model in its own units of length.
 
 Frames: ``cam`` is the frame of the camera; the world frame is arbitrary.
 """

@@ -141,8 +141,8 @@ def is_rolling(rig: Rig, frames: Sequence[str]) -> bool:
 
 
 def unrollings(found: Reconstruction) -> dict[tuple[str, str], Unrolling]:
-    """By frame and camera, of the images that were not exposed all at once at the instants of their frames and show
-    sparse points enough. None where the frames are no film."""
+    """Unrollings, by frame and camera, of the images that were not exposed at once at the instants of their frames and
+    that show enough sparse points. Empty where the frames are no film."""
     rolling = [name for name in found.rig.names if not found.rig[name].shutter.is_plain]
     times, tracks = film_times(found.frames), found.tracks
     if not rolling or times is None or tracks is None:

@@ -100,7 +100,7 @@ def survey_visibility(
     count, names = len(mesh.faces), handpiece.rig.names
     most, images = np.zeros((2, count), dtype=np.int64)
     by_camera, angles_deg = np.zeros((count, len(names)), dtype=bool), np.zeros(count)
-    for faces, seen, eyes in _at_each_pose(mesh, handpiece, rig_from_world, options):
+    for faces, seen, eyes in _faces_by_pose(mesh, handpiece, rig_from_world, options):
         at_once = seen.sum(axis=1)
         most[faces] = np.maximum(most[faces], at_once)
         images[faces] += at_once
@@ -228,7 +228,7 @@ def slope_bounds(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarr
     return rays.min(axis=0), rays.max(axis=0)
 
 
-def _at_each_pose(
+def _faces_by_pose(
     mesh: Mesh, handpiece: Handpiece, rig_from_world: Iterable[Rigid3], options: VisibilityOptions
 ) -> Iterator[tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n c"], Float[np.ndarray, "c 3"]]]:
     """For each pose: the faces near it, which camera sees which of them, and where the cameras are."""

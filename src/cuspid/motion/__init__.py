@@ -1,8 +1,8 @@
 """Where the handpiece was: features, lean pairs, odometry, one bundle adjustment. Only this package knows pycolmap."""
 
-from cuspid.runtime.signals import handlers_kept
+from cuspid.runtime.signals import preserve_handlers
 
-with handlers_kept():  # pycolmap's prints the stack of its own code at SIGTERM
+with preserve_handlers():  # pycolmap's prints the stack of its own code at SIGTERM
     from cuspid.motion.bundle.adjustment import AdjustmentOptions, adjust
     from cuspid.motion.location import MotionOptions, locate
 

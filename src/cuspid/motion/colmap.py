@@ -46,7 +46,7 @@ SCALE_SPREAD = 0.02
 def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
     """The same camera as COLMAP's, which has the same models, parameters and pixel origin; with the nearest of its
     lenses for a splined one, which it lacks."""
-    camera = _with_its_lens(camera)
+    camera = _convert_splined_lens(camera)
     return pycolmap.Camera(
         camera_id=camera_id,
         model=camera.model,
@@ -57,7 +57,7 @@ def colmap_camera(camera: Camera, camera_id: int = 0) -> pycolmap.Camera:
 
 
 @lru_cache(maxsize=64)
-def _with_its_lens(camera: Camera) -> Camera:
+def _convert_splined_lens(camera: Camera) -> Camera:
     return convert_lens(camera, ALL)[0] if camera.lens.splined else camera
 
 
@@ -441,12 +441,10 @@ def from_colmap(model: ColmapModel, capture: Capture, source: str) -> Reconstruc
         ),
         log={"mm_per_model_unit": scale, "scale_spread": spread},
     )
-    return found if found.tracks is None else replace(found, reprojection_rms_px=_rms(residuals_px(found)))
-
-
-def _rms(residuals: Float[np.ndarray, "o 2"]) -> float:
-    """RMS length of the residuals; those behind a camera do not count."""
-    return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
+    if found.tracks is None:
+        return found
+    rms_px = float(np.sqrt(np.nanmean(np.sum(residuals_px(found) ** 2, axis=1))))  # without those behind a camera
+    return replace(found, reprojection_rms_px=rms_px)
 
 
 def read_model(folder: Path, capture: Capture) -> Reconstruction:

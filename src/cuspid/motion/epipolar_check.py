@@ -1,8 +1,8 @@
 """Whether the images of one instant contradict the calibration: how far matches lie from their epipolar lines.
 
-A single instant tells nothing of how far apart the cameras stand, and little of how they are turned towards each other;
-what it would change there are errors of its matches and of the lens model. So it should only be asked to refine a
-calibration that it contradicts.
+A single instant does not determine how far apart the cameras are, and hardly their convergence; what it would change
+there are errors of its matches and of the lens model. So it should only be asked to refine a calibration that it
+contradicts.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cuspid.model.capture import Capture
 from cuspid.model.epipolar import epipolar_residuals, skew
 from cuspid.model.pairing import stereo_pairs
 from cuspid.motion.frontend.features import detect_all
-from cuspid.motion.frontend.odometry import searched_mm
+from cuspid.motion.frontend.odometry import search_range_mm
 from cuspid.motion.frontend.pairs import IndexedFeatures, match_guided
 from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.location import MotionOptions, index_frame
@@ -34,7 +34,7 @@ def epipolar_offset_px(
     capture: Capture, options: MotionOptions, *, cache: Path | None = None, progress: Progress = silent
 ) -> float | None:
     """Median distance of the matches of a pair of cameras from their epipolar lines, the largest over the pairs and
-    frames; None where no pair has matches enough to tell."""
+    frames; None where no pair has enough matches."""
     handpiece, frames = capture.handpiece, [frame.name for frame in capture.frames]
     features = detect_all(Pictures(capture, max_bytes=0), options.sought, progress=progress, cache=cache)
     pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
@@ -43,7 +43,7 @@ def epipolar_offset_px(
         for first, second in (pair for pair in pairs if all(name in views for name in pair)):
             a, b = views[first], views[second]
             b_from_a = handpiece.rig[second].cam_from_rig @ handpiece.rig[first].cam_from_rig.inverse()
-            bounds = searched_mm(handpiece, a), searched_mm(handpiece, b)
+            bounds = search_range_mm(handpiece, a), search_range_mm(handpiece, b)
             matches = match_guided(a, b, b_from_a, *bounds, within)
             if len(matches) < _LEAST_MATCHES:
                 continue

@@ -5,8 +5,8 @@ two cameras if it lies near their epipolar lines, in front of both, at a depth t
 all do; of images that were exchanged nearly none do, but nearly all agree with the cameras that took them. These are
 sought as the assignment of images to cameras with which most matches agree: a quadratic one, by a beam search.
 
-Groups of cameras that see nothing in common may be exchanged as a whole, and everything agrees within a frame. How the
-handpiece moved to the next frame then tells them apart: all groups moved with it.
+Groups of cameras that see nothing in common may be exchanged as a whole, and everything agrees within a frame. The
+motion of the handpiece to the next frame then distinguishes them: all groups moved with it.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ def require_own_images(
     if not found.contradicted:
         return ()
     return (
-        f"motion: hardly a match of the images of {', '.join(found.contradicted)} agrees with the cameras beside, while"
-        " those of others do: look whether it is in its place, and whether its images are its own",
+        f"motion: hardly a match of the images of {', '.join(found.contradicted)} agrees with its neighbours, while "
+        f"those of others do: check whether it is in its place, and whether its images are its own",
     )
 
 
@@ -118,7 +118,7 @@ def check_features(
 ) -> CameraCheck:
     """As :func:`check_cameras`, from the keypoints by (frame, camera) of consecutive frames."""
     names = handpiece.rig.names
-    few = {key: _some(each) for key, each in features.items()}
+    few = {key: _sample_features(each) for key, each in features.items()}
     motion, own = _Motion(handpiece, few, frames, options), np.arange(len(names))
     beside = [(names.index(a), names.index(b)) for a, b in _pairs(handpiece, options)]
     matches = _Matches.of(handpiece, few, frames, options, beside)
@@ -135,9 +135,9 @@ def check_features(
     moved = np.flatnonzero(slots != own)
     agreeing, after = matches.agreeing_as(own, _LOOSE_PX), matches.agreeing_as(slots)
     before, gained = (int(each[moved].sum()) for each in (agreeing, after))
-    ties = _ties(after, matches.counts)[moved]
+    ties = ((after >= _LEAST) & (after >= _TIED_SHARE * matches.counts))[moved]
     tied = ties.any(axis=1).all() and (after[moved][ties].sum() >= _NAMED_SHARE * matches.counts[moved][ties].sum())
-    if len(moved) and tied and (gained >= _GAIN * before or motion.is_told_by(slots, own)):
+    if len(moved) and tied and (gained >= _GAIN * before or motion.is_preferred(slots, own)):
         taken_by = {names[k]: names[slots[k]] for k in moved}
         return CameraCheck(taken_by=taken_by, agreeing=gained, before=before, contradicted=())
     return nothing
@@ -147,7 +147,7 @@ def _pairs(handpiece: Handpiece, options: MotionOptions) -> tuple[tuple[str, str
     return stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
 
 
-def _some(features: Features) -> Features:
+def _sample_features(features: Features) -> Features:
     chosen = np.unique(np.linspace(0, len(features) - 1, _KEYPOINTS).astype(int)) if len(features) else slice(0)
     return Features(
         pixels=features.pixels[chosen], descriptors=features.descriptors[chosen], colors=features.colors[chosen]
@@ -227,11 +227,6 @@ class _Matches:
         return found
 
 
-def _ties(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c c"]:
-    """Which images agree with which others."""
-    return np.asarray((agreeing >= _LEAST) & (agreeing >= _TIED_SHARE * counts))
-
-
 def _fits(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c"]:
     """Which cameras' images agree with most of those beside them."""
     all_of, those = counts.sum(axis=1), agreeing.sum(axis=1)
@@ -240,9 +235,9 @@ def _fits(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> B
 
 def _contradicted_cameras(agreeing: Int[np.ndarray, "c c"], counts: Int[np.ndarray, "c c"]) -> Bool[np.ndarray, "c"]:
     """Cameras of which hardly a match with those beside them agrees, while those of others do."""
-    told = counts >= _TOLD
-    lost = told.any(axis=1) & ~(told & (agreeing >= _LOST_SHARE * counts)).any(axis=1)
-    return np.asarray(lost & (told & (agreeing >= _SHARE * counts)).any())
+    sufficient = counts >= _TOLD
+    lost = sufficient.any(axis=1) & ~(sufficient & (agreeing >= _LOST_SHARE * counts)).any(axis=1)
+    return np.asarray(lost & (sufficient & (agreeing >= _SHARE * counts)).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +250,7 @@ class _Motion:
     options: MotionOptions
 
     @computed_once
-    def tells(self) -> bool:
+    def is_decidable(self) -> bool:
         """Whether there is something to agree on."""
         groups = camera_groups(self.handpiece.rig, self.handpiece.working_distance_mm, self.options.pairing)
         return len(groups) > 1 and len(self.frames) > 1
@@ -263,18 +258,18 @@ class _Motion:
     def is_one(self, slots: Slots) -> bool:
         """Whether nearly all that was matched moved as one."""
         edges = self._edges(slots)
-        return not self.tells or sum(e.matches for e in edges) >= _MOVED_SHARE * sum(e.sought for e in edges)
+        return not self.is_decidable or sum(e.matches for e in edges) >= _MOVED_SHARE * sum(e.sought for e in edges)
 
     def agreeing(self, slots: Slots) -> int:
         """Matches to the next frames that agree on one motion."""
         return sum(edge.matches for edge in self._edges(slots))
 
-    def is_told_by(self, slots: Slots, others: Slots) -> bool:
+    def is_preferred(self, slots: Slots, others: Slots) -> bool:
         """Whether far more moved as one than with other slots."""
-        return self.tells and self.agreeing(slots) >= max(_GAIN * self.agreeing(others), _LEAST)
+        return self.is_decidable and self.agreeing(slots) >= max(_GAIN * self.agreeing(others), _LEAST)
 
     def _edges(self, slots: Slots) -> list[Edge]:
-        if not self.tells:
+        if not self.is_decidable:
             return []
         names, rig = self.handpiece.rig.names, self.handpiece.rig
         camera = {name: names[k] for name, k in zip(names, slots, strict=True)}

@@ -1,4 +1,4 @@
-"""From a capture to metric poses and a sparse model, stage by stage."""
+"""Estimates metric poses and a sparse model from a capture, stage by stage."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _LOOSE_SCALE_PPM, _LOOSE_SPAN_PPM = 1000.0, 300.0
 _ROLLING_SHARE = 0.008
 """Of the height of an image, by which what it shows may move between its rows, before that is known."""
 _HELD = (
-    "calibration: held as in the file, since the images of the one frame share too few points to refine it: its "
+    "calibration: kept as in the file, since the images of the one frame share too few points to refine it: its "
     "cameras stand far apart, or the surface shows little detail"
 )
 
@@ -293,8 +293,8 @@ def locate_features(
         found = _locate_indexed(handpiece, taken, taken, options, refined, progress)
     else:
         rough = _locate_indexed(handpiece, taken, taken, _loosen_for_rolling(options, handpiece), None, progress)
-        found = _locate_indexed(handpiece, taken, _at_instants(taken, rough), options, refined, progress)
-    noted = with_advice(found, options.odometry.min_matches)
+        found = _locate_indexed(handpiece, taken, _unroll_features(taken, rough), options, refined, progress)
+    noted = add_advice(found, options.odometry.min_matches)
     return noted.with_cameras_as(given)
 
 
@@ -310,7 +310,7 @@ def _loosen_for_rolling(options: MotionOptions, handpiece: Handpiece) -> MotionO
     )
 
 
-def _at_instants(taken: Mapping[str, FrameFeatures], found: Reconstruction) -> dict[str, FrameFeatures]:
+def _unroll_features(taken: Mapping[str, FrameFeatures], found: Reconstruction) -> dict[str, FrameFeatures]:
     """The keypoints where they would have been seen at the instants of the frames, by poses that are about right."""
     made = unrollings(found)
 
@@ -369,8 +369,8 @@ def _locate_indexed(
     return replace(adjusted, log={**log, **adjusted.log})
 
 
-def with_advice(found: Reconstruction, least: int) -> Reconstruction:
-    """With notes where fewer points than ``least`` tie frames together, and what would make the path more certain."""
+def add_advice(found: Reconstruction, least: int) -> Reconstruction:
+    """Adds notes where fewer points than ``least`` link frames, with advice on how to make the path more certain."""
     return replace(found, notes=(*found.notes, *_loose_notes(found, least), *_advice(found)))
 
 

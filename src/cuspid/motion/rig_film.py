@@ -15,11 +15,11 @@ from jaxtyping import UInt8
 
 from cuspid.model.capture import Capture, ImageSource
 from cuspid.model.mesh import Mesh
-from cuspid.model.reconstruction import Reconstruction, chosen_tracks
+from cuspid.model.reconstruction import Reconstruction, select_tracks
 from cuspid.model.sparse_model import SparseModel
 from cuspid.motion.bundle.adjustment import adjust
-from cuspid.motion.frontend.patches import PatchOptions, follow_rig_points, hold_together
-from cuspid.motion.location import MotionOptions, locate, with_advice
+from cuspid.motion.frontend.patches import PatchOptions, are_connected, follow_rig_points
+from cuspid.motion.location import MotionOptions, add_advice, locate
 from cuspid.motion.monocular.single import ENAMEL, SingleOptions, normalise_contrast
 from cuspid.runtime.errors import ReconstructionError
 from cuspid.runtime.progress import Progress, silent
@@ -95,7 +95,7 @@ def refine_rig_on_surface(
 
     followed = follow_rig_points(found, read, patches, surface=surface, progress=progress)
     least = options.odometry.min_matches
-    if not hold_together(followed, len(found.frames), least):
+    if not are_connected(followed, len(found.frames), least):
         return None
     rig = capture.handpiece.rig.in_own_order()
     start = replace(found, tracks=followed, notes=()).with_cameras_as(rig.names)
@@ -104,17 +104,17 @@ def refine_rig_on_surface(
         adjusted = adjust(replace(start, rig=rig), options.adjustment)
     except ReconstructionError:
         return None
-    return with_advice(adjusted, least).with_cameras_as(found.rig.names)
+    return add_advice(adjusted, least).with_cameras_as(found.rig.names)
 
 
-def of_camera(found: Reconstruction, camera: str, frames: Collection[str]) -> SparseModel:
+def trajectory_of_camera(found: Reconstruction, camera: str, frames: Collection[str]) -> SparseModel:
     """The trajectory of one camera of the handpiece over those of the frames that were located, and the points that it
     sees there; in millimetres."""
     assert found.tracks is not None
     tracks, mounted = found.tracks, found.rig[camera]
     has = np.array([name in frames for name in found.frames], dtype=bool)
     mine = (tracks.camera_index == found.rig.names.index(camera)) & has[tracks.frame_index]
-    seen = chosen_tracks(tracks, mine)
+    seen = select_tracks(tracks, mine)
     return SparseModel(
         camera=mounted.camera,
         cam_from_world={

@@ -17,7 +17,7 @@ from cuspid.model.pairing import stereo_pairs
 from cuspid.model.rig import Handpiece
 from cuspid.motion.frontend.features import Features
 from cuspid.motion.frontend.odometry import Cloud, Edge, FrameFeatures, relative_pose, triangulate_frame
-from cuspid.motion.frontend.revisits import WORDS, look, typical
+from cuspid.motion.frontend.revisits import WORDS, look, visual_words
 from cuspid.motion.location import MotionOptions, index_frame, loosen_tolerances
 
 Recall = Callable[[str], Mapping[tuple[str, str], Features]]
@@ -71,7 +71,7 @@ class Tracker:
             return self._lose(f"only {len(frame.cloud.points)} points seen in stereo; {least} are needed")
         if not self.rig_from_world:
             return self._keep(frame, Rigid3.identity(), None)
-        found = self._beside_the_last(frame) or self._where_it_has_been(frame)
+        found = self._match_previous(frame) or self._relocalise(frame)
         if found is None:
             return self._lose(f"fewer than {least} matches to the frames before, or too small a share of them agreed")
         other, target_from_source = found
@@ -97,7 +97,7 @@ class Tracker:
         self._recent.append(frame)
         descriptors = [view.features.descriptors for view in frame.views.values()]
         if self._words is None and sum(map(len, descriptors)) >= WORDS:
-            self._words = typical(descriptors, self._options.seed)
+            self._words = visual_words(descriptors, self._options.seed)
         if self._words is not None:
             self._looks[frame.name] = look(descriptors, self._words)
         return Placed(rig_from_world=rig_from_world, beside=beside, reason=None)
@@ -106,14 +106,14 @@ class Tracker:
         self._lost = True
         return Placed(rig_from_world=None, beside=None, reason=reason)
 
-    def _beside_the_last(self, frame: _PlacedFrame) -> tuple[_PlacedFrame, Rigid3] | None:
+    def _match_previous(self, frame: _PlacedFrame) -> tuple[_PlacedFrame, Rigid3] | None:
         """The frame before, if that could be placed and this one beside it."""
         if self._lost or not self._recent:
             return None
         edge = self._edge(self._recent[-1], frame)
         return None if edge.target_from_source is None else (self._recent[-1], edge.target_from_source)
 
-    def _where_it_has_been(self, frame: _PlacedFrame) -> tuple[_PlacedFrame, Rigid3] | None:
+    def _relocalise(self, frame: _PlacedFrame) -> tuple[_PlacedFrame, Rigid3] | None:
         """Of the last frames and those that look most like this one, the one that it has most in common with."""
         tried = [*self._recent, *self._look_alikes(frame)]
         edges = [(other, self._edge(other, frame)) for other in tried]

@@ -71,13 +71,12 @@ def measure_moving_cameras(
     found = list[DepthMap]()
     for name in handpiece.rig.names:
         moved = f"{name}+"
-        pair = moving_pair(handpiece, name, next_from_rig, stereo.pairing)
+        pair = consecutive_pair(handpiece, name, next_from_rig, stereo.pairing)
         if name not in images or name not in next_images or pair is None:
             continue
         both = {name: images[name], moved: next_images[name]}
-        views = prepare_views(
-            *(pair, {name: (moved,), moved: (name,)}, handpiece.working_distance_mm, handpiece.depth_range_mm, stereo)
-        )
+        sources = {name: (moved,), moved: (name,)}
+        views = prepare_views(pair, sources, handpiece.working_distance_mm, handpiece.depth_range_mm, stereo)
         measured = measure_views(views, both, handpiece.depth_range_mm, resolution, stereo, widenings=())
         found += depth_maps_of(views, measured, both, masks, frame, resolution, stereo.confidence, stereo.grid_px)
     return tuple(_discount_weight(depth_map, options.confidence_share) for depth_map in found)
@@ -89,7 +88,7 @@ def _discount_weight(depth_map: DepthMap, share: float) -> DepthMap:
     return replace(depth_map, confidence=(share * depth_map.confidence).astype(np.float32), best_mm=best_mm)
 
 
-def moving_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options: PairingOptions) -> Rig | None:
+def consecutive_pair(handpiece: Handpiece, name: str, next_from_rig: Rigid3, options: PairingOptions) -> Rig | None:
     """A camera and the same camera at the next frame; None where they are no stereo pair."""
     mounted = handpiece.rig[name]
     moved = MountedCamera(mounted.camera, mounted.cam_from_rig @ next_from_rig)
@@ -158,8 +157,8 @@ def _sightings(images: Sequence[tuple[str, str]], found: Reconstruction) -> list
     frames, cameras = list(found.frames), list(found.rig.names)
     number = tracks.frame_index * len(cameras) + tracks.camera_index
     order = np.argsort(number, kind="stable")
-    wanted = np.array([frames.index(frame) * len(cameras) + cameras.index(camera) for frame, camera in images])
-    start, end = (np.searchsorted(number[order], wanted, side) for side in ("left", "right"))
+    image_numbers = np.array([frames.index(frame) * len(cameras) + cameras.index(camera) for frame, camera in images])
+    start, end = (np.searchsorted(number[order], image_numbers, side) for side in ("left", "right"))
     return [np.unique(tracks.point_index[order[a:b]]) for a, b in zip(start, end, strict=True)]
 
 

@@ -159,7 +159,7 @@ def _tolerance_mm(
     return usual if one.smooth is None else np.where(one.smooth, options.smooth_sigmas * one.sigma_mm, usual)
 
 
-def at_near_borders(
+def occlusion_borders(
     one: Measured, other: Measured, radius: int, resolution: Resolution, options: ConfidenceOptions
 ) -> Bool[np.ndarray, "h w"]:
     """True for pixels of one of two cameras where there is another surface behind within ``radius`` pixels of the grid:
@@ -195,13 +195,13 @@ def _shift_values(values: Float[np.ndarray, "h w"], down: int, right: int) -> Fl
     return padded[top : top + height, left : left + width]
 
 
-def sure_enough(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:
+def is_certain(one: Measured, resolution: Resolution, options: ConfidenceOptions) -> Bool[np.ndarray, "h w"]:
     """True where the standard deviation of the depth is small enough; that of a smooth surface is known to be large."""
     sure = np.asarray(one.sigma_mm <= options.max_sigma * resolution.depth_step_mm(one.depth_mm))
     return sure if one.smooth is None else sure | one.smooth
 
 
-def without_speckle(
+def reject_speckle(
     depth_mm: Float[np.ndarray, "h w"],
     resolution: Resolution,
     options: ConfidenceOptions,

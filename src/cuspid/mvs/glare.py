@@ -6,7 +6,7 @@ what is compared. Crossed polarisers leave a few percent of it, spread over a sp
 rough: some digital numbers, as much as the shade changes over many pixels. Where the spots lie follows from the places
 of the lights and a first depth; how bright they are, from a common model of gloss with the values of a wet surface.
 They are taken off, and what is left of a spot (its strength may be another, and the first depth is wrong where it was
-pulled) tells how far to trust the comparison.
+pulled) decides how far to trust the comparison.
 
 Light that is scattered below a clear surface leaves it the less the more oblique it is (Fresnel): of wet enamel 5 %
 less at 60 degrees, 25 % at 77. That is known well enough to be made up for.
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from cuspid.geometry import unit
-from cuspid.geometry.gloss import coat, leaving
+from cuspid.geometry.gloss import coat, transmittance
 from cuspid.model.camera import Camera
 from cuspid.model.rig import Light
 from cuspid.runtime.kernels import kernel
@@ -61,7 +61,7 @@ def estimate_glare(
     lights: Sequence[Light],
     exit_index: float,
 ) -> Glare:
-    """What a first depth tells of each pixel of its grid, with lights in the frame of its camera and the refractive
+    """What a first depth implies for each pixel of its grid, with lights in the frame of its camera and the refractive
     index of the surface."""
     rays = grid.rays(grid.pixel_centres().reshape(-1, 2)).reshape(grid.height, grid.width, 3)
     spots, share = np.zeros((2, *rays.shape), np.float32), np.ones(depth_mm.shape, np.float32)
@@ -73,7 +73,7 @@ def estimate_glare(
         known = np.isfinite(normals).all(axis=-1)
         points = rays[known] / inverse[known, None]
         spot[known] = mirror_reflections(points, normals[known], lights)
-        share[known] = _leaving(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
+        share[known] = _transmittances(-(normals[known] * unit(points)).sum(axis=-1), exit_index)
     past_pits, spot = spots
     return Glare(spot, STRENGTH * spot + _PLACE * np.maximum(past_pits - spot, 0), share)
 
@@ -126,8 +126,8 @@ def _gloss(falling, facing, halfway, grazing):
 
 @kernel(fastmath=True)
 @no_type_check
-def _leaving(facing, index):
+def _transmittances(facing, index):
     out = np.empty_like(facing)
     for i in range(len(out)):
-        out[i] = leaving(max(facing[i], _OBLIQUE), index)
+        out[i] = transmittance(max(facing[i], _OBLIQUE), index)
     return out

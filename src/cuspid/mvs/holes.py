@@ -133,7 +133,9 @@ def _hidden(depth_map: DepthMap, in_cam: Float[np.ndarray, "n 3"], agreement_mm:
     return np.asarray(nearer & depth_map.known[row, column])
 
 
-def covering(candidates: Sequence[Int[np.ndarray, "_"]], count: int, left: float = 0, *, least: int = 1) -> list[int]:
+def greedy_cover(
+    candidates: Sequence[Int[np.ndarray, "_"]], count: int, left: float = 0, *, least: int = 1
+) -> list[int]:
     """Indices (ascending) of sets of points, out of ``count``, that cover what all sets cover together, except for at
     most ``left`` points: greedily the set that adds most, as long as it adds at least ``least`` (>= 1)."""
     missing = np.zeros(count, dtype=bool)

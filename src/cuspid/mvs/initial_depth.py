@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from cuspid.model.pairing import worth_of_angle
+from cuspid.model.pairing import angle_weight
 from cuspid.model.rig import Rig
 from cuspid.mvs.rectification import RectifiedPair
 from cuspid.runtime.options import Options, Range
@@ -94,7 +94,7 @@ def initial_pairs(rig: Rig, sources: Mapping[str, Sequence[str]], distance_mm: f
 
 def _suits(rig: Rig, name: str, other: str, distance_mm: float) -> float:
     angle_deg = rig.meeting_deg(name, other, distance_mm)
-    alike = float(worth_of_angle(np.array(angle_deg))) * rig.overlap(name, other, distance_mm)
+    alike = float(angle_weight(np.array(angle_deg))) * rig.overlap(name, other, distance_mm)
     return float(np.sin(np.deg2rad(angle_deg))) * alike
 
 

@@ -24,10 +24,10 @@ from cuspid.mvs.confidence import (
     Measured,
     Resolution,
     agreement,
-    at_near_borders,
     confidence,
-    sure_enough,
-    without_speckle,
+    is_certain,
+    occlusion_borders,
+    reject_speckle,
 )
 from cuspid.mvs.detail import find_bold_texture
 from cuspid.mvs.initial_depth import initial_pairs, initial_points, semi_global
@@ -221,7 +221,7 @@ _Map = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
 """Does some work on each item; the results, in order."""
 
 
-def _one_by_one(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+def map_in_sequence(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     return [work(item) for item in items]
 
 
@@ -299,23 +299,28 @@ class DepthEstimator:
         are zero where an image shows what is not to be measured. ``alone``: no other frame is measured meanwhile, so
         that the views are measured side by side.
 
-        Raises InputError where shading is to be matched and it is not told which of several patterns was on.
+        Raises InputError where shading is to be matched and it is unknown which of several patterns was on.
         """
         if self.signal == "shading" and lighting is None and len(self.handpiece.lightings) > 1:
             known = ", ".join(each.name for each in self.handpiece.lightings)
             raise InputError(
-                f"frame {frame}: which lights were on is not told, and plain surfaces are matched by them; give each "
+                f"frame {frame}: which lights were on is unknown, but plain surfaces are matched by them; give each "
                 f"frame's lighting in capture.json ({known}), or import the footage with --lightings"
             )
         names = self.handpiece.rig.names
-        work = map_in_threads if alone else _one_by_one
+        work = map_in_threads if alone else map_in_sequence
         found = list[DepthMap]()
         for views in self._view_sets(tuple(name for name in names if name in images and not _is_blank(images[name]))):
             if self.signal == "shading":
-                measured = self._by_shading(views, images, lighting)
+                measured = self._measure_shading(views, images, lighting)
             else:
                 measured = measure_views(
-                    *(views, images, self.handpiece.depth_range_mm, self.resolution, self.options, work),
+                    views,
+                    images,
+                    self.handpiece.depth_range_mm,
+                    self.resolution,
+                    self.options,
+                    work,
                     widenings=() if self.handpiece.lights else WIDENINGS,
                 )
             maps = depth_maps_of(
@@ -338,7 +343,7 @@ class DepthEstimator:
         bold = {view.name: self._bold_on_grid(view, images[view.name]) for view in views.views}
         if max(where.mean() for where in bold.values()) < _LEAST_BOLD:
             return list(shaded)
-        found = self._by_texture.measure({name: images[name] for name in bold}, frame, masks=masks)
+        found = self._texture_estimator.measure({name: images[name] for name in bold}, frame, masks=masks)
         textured = {each.camera_name: each for each in found}
         return [
             merge_depths(each, textured[each.camera_name], bold[each.camera_name])
@@ -352,10 +357,12 @@ class DepthEstimator:
         return np.asarray(_grid_of(bold, self.options.grid_px) > 0)
 
     @computed_once
-    def _by_texture(self) -> DepthEstimator:
+    def _texture_estimator(self) -> DepthEstimator:
         return DepthEstimator(self.handpiece, self.options, resolution_mm=self.resolution.mm)
 
-    def _by_shading(self, views: ViewSet, images: Mapping[str, Levels], lighting: str | None) -> Mapping[int, Measured]:
+    def _measure_shading(
+        self, views: ViewSet, images: Mapping[str, Levels], lighting: str | None
+    ) -> Mapping[int, Measured]:
         stack = brightness(views.views, [_rgb(images[view.name]) for view in views.views], views.corrections)
         shaded = [
             ShadedView(
@@ -385,7 +392,7 @@ class Match:
         images: Mapping[str, Levels],
         depth_range_mm: tuple[float, float],
         options: StereoOptions,
-        work: _Map = _one_by_one,
+        work: _Map = map_in_sequence,
         *,
         shaded: bool = False,
     ) -> None:
@@ -502,7 +509,7 @@ def measure_views(
     depth_range_mm: tuple[float, float],
     resolution: Resolution,
     options: StereoOptions,
-    work: _Map = _one_by_one,
+    work: _Map = map_in_sequence,
     *,
     widenings: Sequence[int] = WIDENINGS,
 ) -> Mapping[int, Measured]:
@@ -519,7 +526,7 @@ def measure_views(
         before = dict(measured)
 
         def again(index: int, widening: int = widening, before: Mapping[int, Measured] = before) -> Measured:
-            agreed = agreed_planes(before[index], sources_of(views, index, before), resolution, options.confidence)
+            agreed = consistent_planes(before[index], sources_of(views, index, before), resolution, options.confidence)
             return before[index] if agreed is None else match.widen(index, before[index], agreed, widening)
 
         measured = dict(zip(views.references, work(again, views.references), strict=True))
@@ -529,7 +536,7 @@ def measure_views(
 
     def regularise(index: int) -> Measured:
         one = matched[index]
-        agreed = agreeing(one, sources_of(views, index, matched), resolution, options.confidence)
+        agreed = are_consistent(one, sources_of(views, index, matched), resolution, options.confidence)
         weak = find_weak_texture(agreed, one.begun)
         return match.regularise(index, one, planes_of(one, agreed), weak) if weak.mean() > _LEAST_WEAK else one
 
@@ -541,13 +548,13 @@ def sources_of(views: ViewSet, index: int, measured: Mapping[int, Measured]) -> 
     return [measured[source] for source in views.sources[index] if source in measured]
 
 
-def agreed_planes(
+def consistent_planes(
     one: Measured, others: Sequence[Measured], resolution: Resolution, checks: ConfidenceOptions
 ) -> Float[np.ndarray, "h w 6"] | None:
-    """The planes of a view that others agree with; None where these are most of what it began with, so that it is not
-    worth looking for more."""
+    """The planes of a view that others agree with; None where these are most of what it began with, so that another
+    search would not pay."""
     assert one.begun is not None
-    agreed = agreeing(one, others, resolution, checks)
+    agreed = are_consistent(one, others, resolution, checks)
     return None if agreed.sum() >= MOST_AGREED * one.begun.sum() else planes_of(one, agreed)
 
 
@@ -557,11 +564,11 @@ def planes_of(one: Measured, where: Bool[np.ndarray, "h w"]) -> Float[np.ndarray
     return np.asarray(one.planes * where[..., None], dtype=np.float64)
 
 
-def agreeing(
+def are_consistent(
     one: Measured, others: Sequence[Measured], resolution: Resolution, checks: ConfidenceOptions
 ) -> Bool[np.ndarray, "h w"]:
     """Where other views agree with the depth of a view, and it is sure enough of it."""
-    return (agreement(one, others, resolution, checks) > 0) & sure_enough(one, resolution, checks)
+    return (agreement(one, others, resolution, checks) > 0) & is_certain(one, resolution, checks)
 
 
 def find_weak_texture(
@@ -589,7 +596,7 @@ def depth_maps_of(
 ) -> list[DepthMap]:
     """The depth maps of the references of a set, all of which were measured."""
     return [
-        checked_depth_map(
+        filter_depth_map(
             measured[index],
             sources_of(views, index, measured),
             images[view.name],
@@ -604,7 +611,7 @@ def depth_maps_of(
     ]
 
 
-def checked_depth_map(
+def filter_depth_map(
     one: Measured,
     others: Sequence[Measured],
     image: Levels,
@@ -622,13 +629,13 @@ def checked_depth_map(
     counts = np.ones(one.depth_mm.shape, dtype=bool)
     if mask is not None:
         counts = _grid_of(view.resample_mask(mask), grid_px) > 0
-    agreed = counts & agreeing(one, others, resolution, checks)
+    agreed = counts & are_consistent(one, others, resolution, checks)
     if len(others) == 1:
-        agreed &= ~at_near_borders(one, others[0], -(-checks.border_px // grid_px), resolution, checks)
+        agreed &= ~occlusion_borders(one, others[0], -(-checks.border_px // grid_px), resolution, checks)
     speckle = replace(
         checks, speckle_px=min(checks.speckle_px, round(checks.speckle_px * (_SPACING_PX / grid_px) ** 2))
     )
-    keep = without_speckle(np.where(agreed, one.depth_mm, np.nan), resolution, speckle, one.smooth)
+    keep = reject_speckle(np.where(agreed, one.depth_mm, np.nan), resolution, speckle, one.smooth)
     matched = counts & np.isfinite(one.depth_mm)
     funnel = Funnel(
         pixels=int(counts.sum()),

@@ -55,7 +55,7 @@ def sweep(
     for number, q in enumerate(labels):
         seen = []
         for (other, to_other), a, b in zip(others, geometry.infinite, geometry.parallax, strict=True):
-            homography = np.linalg.inv(to_other) @ (a + q * _column(b)) @ to_full
+            homography = np.linalg.inv(to_other) @ (a + q * np.outer(b, [0.0, 0.0, 1.0])) @ to_full
             seen.append(_zncc(one, mean, variance, *_warp_image(other, homography, one.shape), noise_dn))
         # Half of the sources may look past what is in front of the surface there.
         best = np.sort(np.stack(seen), axis=0)[len(seen) // 2 :]
@@ -63,12 +63,7 @@ def sweep(
     chosen = semi_global(1 - zncc, _SMALL, _LARGE)
     at = np.take_along_axis(zncc, np.rint(chosen).astype(np.int64)[..., None], axis=2)[..., 0]
     q = np.where(at >= _LEAST_ZNCC, np.clip(low + step * chosen, low, high), np.nan)
-    return _on_grid(q, np.linalg.inv(to_full), (height, width), spacing_px), SIGMA_PX / scale
-
-
-def _column(parallax: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """What adds the parallax to the third column of a homography."""
-    return np.outer(parallax, [0.0, 0.0, 1.0])
+    return _sample_grid(q, np.linalg.inv(to_full), (height, width), spacing_px), SIGMA_PX / scale
 
 
 def _downsample(
@@ -117,7 +112,7 @@ def _zncc(
     return np.where(_blur(shown) > 0.99, zncc, 0).astype(np.float32)
 
 
-def _on_grid(
+def _sample_grid(
     values: Float[np.ndarray, "h w"], from_full: Float[np.ndarray, "3 3"], size: tuple[int, int], spacing_px: int
 ) -> Float[np.ndarray, "rows columns"]:
     """The nearest value at every ``spacing_px``-th pixel of the whole image."""

@@ -5,17 +5,17 @@ of them. Normalising brightness over a window, as for texture, would remove what
 places, one for each channel, give three shades of one exposure (R. Woodham, Optical Engineering 19, 1980, has the idea
 for one camera). Then the ratios of the channels are compared: the gain of a camera, the falloff of its lens, the colour
 of the tooth and the light that does not leave a clear surface at grazing angles are the same in all channels, and
-cancel. Under lights of one colour brightness itself must be compared, and a first depth tells how much of it was lost.
-Mirror reflections move with the camera: crossed polarisers take most of them away, a first depth tells what is left
-(:mod:`cuspid.mvs.glare`), which is taken off; what burns out is not compared, and a camera that differs from the
-others is left out.
+cancel. Under lights of one colour brightness itself must be compared, and a first depth shows how much of it was lost.
+Mirror reflections move with the camera: crossed polarisers take most of them away, a first depth predicts what is left
+(:mod:`cuspid.mvs.glare`), which is taken off; what burns out is not compared, and a camera that differs from the others
+is left out.
 
 First planes of constant inverse depth are swept (R. Collins, CVPR 1996) over a coarse grid, by clipped absolute
 differences of the better half of the cameras, and the plane of each cell is chosen by semi-global optimisation. Then a
 slanted plane is fitted around each pixel by Gauss-Newton, as in :mod:`cuspid.mvs.refinement`, whose notation is used
 here, with the plain differences of brightness as residuals. Last a smooth surface is laid through all of them
-(:mod:`cuspid.mvs.smoothing`): windows are small, and where the shade does not change none of them tells much. It may
-bend where the colour changes.
+(:mod:`cuspid.mvs.smoothing`): windows are small, and where the shade does not change they carry little information. It
+may bend where the colour changes.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class ShadingOptions(Options):
     """A camera whose difference exceeds the best one's by more sees something else."""
     bend_px: Annotated[float, Range(0.001, 1000)] = 0.14
     """How much a surface bends from one pixel of the depth map to the next: change of its slope, px of disparity.
-    Smaller values make surfaces smoother where the images tell little about them."""
+    Smaller values make surfaces smoother where the images constrain them weakly."""
     glare_dn: Annotated[float, Range(0.001, 1000)] = 0.05
     """Where mirror reflections of the lights are uncertain by this much (digital numbers), brightness counts half."""
     exit_index: Annotated[float, Range(1, 3)] = 1.4
@@ -267,10 +267,6 @@ def _sweep(
         costs[..., k] = cv2.blur(costs[..., k], (3, 3))
     label = semi_global(costs, options.small_jump, options.large_jump)
     return np.asarray(planes[0] + label * options.sweep_step_px)
-
-
-def _every(count: int, spacing: int) -> Int[np.ndarray, "n"]:
-    return np.arange(spacing // 2, count, spacing)
 
 
 @kernel
@@ -450,11 +446,10 @@ def shaded_depths(
     ``images`` are those of :func:`brightness`.
     """
     blurred = np.stack([_masked_blur(image, options.blur_px) for image in images])
-    compared_of = _ratios if _are_coloured(views[0].lights) else _as_they_are
+    compared_of = _ratios if _are_coloured(views[0].lights) else _intensities
     compared, trust = compared_of(blurred, np.ones_like(blurred))
-    how = depth_range_mm, spacing_px, options
     refinements = [
-        _Refinement(compared, hue, index, view, *how)
+        _Refinement(compared, hue, index, view, depth_range_mm, spacing_px, options)
         for index, (view, hue) in enumerate(zip(views, _hues(blurred), strict=True))
     ]
     found = [each.refine(compared, trust, _LENIENT) for each in refinements]
@@ -501,7 +496,7 @@ def _are_coloured(lights: Sequence[Light]) -> bool:
     return any(np.abs(unit(one.colour) - unit(lights[0].colour)).max() > _COLOURED for one in lights)
 
 
-def _as_they_are(images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"]) -> _Compared:
+def _intensities(images: Float32[np.ndarray, "c h w 3"], trust: Float32[np.ndarray, "c h w 3"]) -> _Compared:
     return images, trust
 
 
@@ -549,7 +544,7 @@ class _Refinement:
         geometry = self._geometry = view.geometry
         self._spacing_px, self._bend_px = spacing_px, options.bend_px
         self._view = _View(images, images, reference, geometry.infinite, geometry.parallax, geometry.others)
-        self._rows, self._columns = (_every(count, spacing_px) for count in view.size)
+        self._rows, self._columns = (np.arange(spacing_px // 2, count, spacing_px) for count in view.size)
         self._colours = colours[np.ix_(self._rows, self._columns)]
         lowest, highest = (view.geometry.scale / depth for depth in reversed(depth_range_mm))
         self._fit = _fit(options, lowest, highest)

@@ -33,20 +33,20 @@ under clinical optics, most images 0.8-0.95), plain enamel 0.12-0.2, in images o
 def choose_signal(capture: Capture, options: StereoOptions) -> Signal:
     """What depth is best measured from.
 
-    Shade tells something only where the lights are known. Where they are, and what is lit shows little detail, a few
-    frames are matched both ways, and the way that gives more depth on which the views agree is taken; where both are
-    there, as with plain teeth beside sprayed gums, that is by shade, for there bold texture is matched as such.
+    Shade is a signal only where the lights are known. Where they are, and what is lit shows little detail, a few frames
+    are matched both ways, and the way that gives more depth on which the views agree is taken; where both are there, as
+    with plain teeth beside sprayed gums, that is by shade, for there bold texture is matched as such.
     """
     if not capture.handpiece.lights or shows_detail(capture):
         return "texture"
     frames = [capture.frames[k] for k in sorted({0, len(capture.frames) // 2})]
-    by_texture = _agreed_share(capture, frames, options, "texture")
+    by_texture = _consistent_share(capture, frames, options, "texture")
     if by_texture >= _MOST_OF_IT and _plain_share(capture, frames) < _LEAST_PLAIN:
         return "texture"
-    return "texture" if by_texture >= _agreed_share(capture, frames, options, "shading") else "shading"
+    return "texture" if by_texture >= _consistent_share(capture, frames, options, "shading") else "shading"
 
 
-def _agreed_share(capture: Capture, frames: Sequence[Frame], options: StereoOptions, signal: Signal) -> float:
+def _consistent_share(capture: Capture, frames: Sequence[Frame], options: StereoOptions, signal: Signal) -> float:
     """Share of the pixels of some frames that get a depth which is kept."""
     estimator = DepthEstimator(capture.handpiece, options, signal=signal)
     funnel = sum_funnels(
@@ -64,11 +64,11 @@ def shows_detail(capture: Capture) -> bool:
     images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
     chosen = {images[k] for k in np.linspace(0, len(images) - 1, _LOOKED_AT).astype(int)} if images else set()
     grays = [gray(capture.image(*each)) for each in sorted(chosen, key=images.index)]
-    details = [(detail, _least_dn(image)) for image in grays if (detail := detail_dn(image)) is not None]
+    details = [(detail, _texture_threshold_dn(image)) for image in grays if (detail := detail_dn(image)) is not None]
     return not details or bool(np.median([one / least for one, least in details]) >= 1)
 
 
-def _least_dn(image: UInt8[np.ndarray, "h w"]) -> float:
+def _texture_threshold_dn(image: UInt8[np.ndarray, "h w"]) -> float:
     """Detail of an image of texture."""
     return max(_TEXTURE_DN, _SHADE_DN * (_SHADE_PX / min(image.shape)) ** 2)
 
@@ -90,7 +90,7 @@ def _plain_share(capture: Capture, frames: Sequence[Frame]) -> float:
 
 
 def _is_plain(image: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    return np.asarray(detail_power(image) < (_PLAIN * _least_dn(image)) ** 2)
+    return np.asarray(detail_power(image) < (_PLAIN * _texture_threshold_dn(image)) ** 2)
 
 
 def _lit_pixels(image: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

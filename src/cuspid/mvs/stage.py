@@ -17,10 +17,10 @@ from cuspid.model.reconstruction import DepthMap, Reconstruction, SurfacePoints
 from cuspid.model.tolerances import without_covariances
 from cuspid.mvs.across import (
     AcrossOptions,
+    consecutive_pair,
     measure_moving_cameras,
-    moving_pair,
 )
-from cuspid.mvs.holes import Sightings, Views, covering
+from cuspid.mvs.holes import Sightings, Views, greedy_cover
 from cuspid.mvs.matching import (
     DepthEstimator,
     Signal,
@@ -122,20 +122,20 @@ def measure_enough_depth(
     """
     if left_share == 0 or (found.tracks is None and left_share < 1):
         return measure_depth(capture, folder, options, progress=progress)
-    every_second = _every_second(capture.frames)
+    every_second = _select_every_second(capture.frames)
     depths = measure_depth(replace(capture, frames=every_second), folder, options, progress=progress)
     if found.tracks is None or left_share == 1:
         return depths
     sightings = Sightings.of(found, found.tracks)
     missing = sightings.count_confirmations(depths, found.rig_from_world, agreement_mm) < _ENOUGH_MAPS
     between = _unmeasured_frames(capture, set(every_second), sightings, missing, left_share, options)
-    return depths | measure_depth(
-        *(replace(capture, frames=between), folder, options),
-        progress=lambda _, done, total: progress("more depth", done, total),
+    more = measure_depth(
+        replace(capture, frames=between), folder, options, progress=lambda _, *of: progress("more depth", *of)
     )
+    return depths | more
 
 
-def _every_second(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+def _select_every_second(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     """Of the frames of each lighting pattern."""
     ranks = Counter[str | None]()
     kept = []
@@ -158,7 +158,7 @@ def _unmeasured_frames(
     groups = camera_groups(capture.handpiece.rig, capture.handpiece.working_distance_mm, options.pairing)
     tried = [(frame, group) for frame in capture.frames if frame not in measured for group in groups]
     shown = [sightings.in_stereo(frame.name, group) for frame, group in tried]
-    taken = covering([points[missing[points]] for points in shown], len(missing), left_share * len(missing))
+    taken = greedy_cover([points[missing[points]] for points in shown], len(missing), left_share * len(missing))
     cameras: dict[Frame, set[str]] = {}
     for frame, group in (tried[index] for index in taken):
         cameras.setdefault(frame, set()).update(group)
@@ -191,11 +191,11 @@ def measure_depth_across(
         sightings = Sightings.of(found, found.tracks)
         missing = sightings.count_confirmations(depths, found.rig_from_world, agreement_mm) < min_maps
         tried = [(step, camera) for step in steps.values() for camera in step.now.cameras]
-        taken = _that_fill_holes(tried, sightings, missing, left_share)
+        taken = _steps_for_missing_points(tried, sightings, missing, left_share)
         if holes is not None:
             images = [(frame.name, camera) for step, camera in tried for frame in (step.now, step.after)]
-            taken |= _that_fill_small_holes(tried, taken, Views.of(holes, found, images, depths, agreement_mm))
-        steps = _of_cameras(tried, taken)
+            taken |= _steps_for_small_holes(tried, taken, Views.of(holes, found, images, depths, agreement_mm))
+        steps = _group_by_frame(tried, taken)
 
     def measure(frame: Frame) -> tuple[DepthMap, ...]:
         step = steps[frame.name]
@@ -228,30 +228,30 @@ class _Step:
 
 def _steps(capture: Capture, rig_from_world: Mapping[str, Rigid3], stereo: StereoOptions) -> dict[str, _Step]:
     """From each located frame, by its name, to the next of its lighting pattern, with the cameras that moved enough."""
-    following = _following([frame for frame in capture.frames if frame.name in rig_from_world])
+    following = _next_frames([frame for frame in capture.frames if frame.name in rig_from_world])
     cameras, steps = capture.handpiece.rig.in_own_order().names, dict[str, _Step]()
     for now in capture.frames:
         if now.name in following:
             after = following[now.name]
             motion = rig_from_world[after.name] @ rig_from_world[now.name].inverse()
             both = [camera for camera in cameras if camera in now.cameras and camera in after.cameras]
-            moved = [c for c in both if moving_pair(capture.handpiece, c, motion, stereo.pairing) is not None]
+            moved = [c for c in both if consecutive_pair(capture.handpiece, c, motion, stereo.pairing) is not None]
             if moved:
                 steps[now.name] = _Step(now, after, motion).with_cameras(moved)
     return steps
 
 
-def _that_fill_holes(
+def _steps_for_missing_points(
     tried: Sequence[tuple[_Step, str]], sightings: Sightings, missing: Bool[np.ndarray, "p"], left_share: float
 ) -> set[int]:
     """Which steps of a camera show points that are missing."""
     if missing.sum() <= left_share * len(missing):
         return set()
     shown = [sightings.both((step.now.name, camera), (step.after.name, camera)) for step, camera in tried]
-    return set(covering([points[missing[points]] for points in shown], len(missing), left_share * len(missing)))
+    return set(greedy_cover([points[missing[points]] for points in shown], len(missing), left_share * len(missing)))
 
 
-def _that_fill_small_holes(tried: Sequence[tuple[_Step, str]], taken: set[int], views: Views) -> set[int]:
+def _steps_for_small_holes(tried: Sequence[tuple[_Step, str]], taken: set[int], views: Views) -> set[int]:
     """Which further steps of a camera it takes to show each place several times: one alone leaves gaps of its own."""
     shown = [views.both((step.now.name, camera), (step.after.name, camera)) for step, camera in tried]
     times, further = np.zeros(views.count, dtype=np.int64), set[int]()
@@ -262,14 +262,14 @@ def _that_fill_small_holes(tried: Sequence[tuple[_Step, str]], taken: set[int], 
         untaken = [places[left[places]] for places in shown]
         for index in taken | further:
             untaken[index] = untaken[index][:0]
-        more = covering(untaken, views.count, least=_LEAST_PLACES)
+        more = greedy_cover(untaken, views.count, least=_LEAST_PLACES)
         for index in more:
             times[shown[index]] += 1
         further |= set(more)
     return further
 
 
-def _of_cameras(tried: Sequence[tuple[_Step, str]], taken: set[int]) -> dict[str, _Step]:
+def _group_by_frame(tried: Sequence[tuple[_Step, str]], taken: set[int]) -> dict[str, _Step]:
     """The steps that were taken, by the names of their frames, each with its cameras."""
     cameras: dict[str, list[str]] = {}
     steps: dict[str, _Step] = {}
@@ -279,7 +279,7 @@ def _of_cameras(tried: Sequence[tuple[_Step, str]], taken: set[int]) -> dict[str
     return {name: step.with_cameras(cameras[name]) for name, step in steps.items()}
 
 
-def _following(located: Sequence[Frame]) -> dict[str, Frame]:
+def _next_frames(located: Sequence[Frame]) -> dict[str, Frame]:
     """For each frame, but the last of each lighting pattern, the next one of that pattern."""
     following: dict[str, Frame] = {}
     latest: dict[str | None, Frame] = {}

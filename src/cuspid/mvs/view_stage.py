@@ -23,9 +23,9 @@ from cuspid.mvs.matching import (
     WIDENINGS,
     Match,
     StereoOptions,
-    agreed_planes,
-    checked_depth_map,
     coarser,
+    consistent_planes,
+    filter_depth_map,
     gray,
     prepare_views,
 )
@@ -91,12 +91,12 @@ class _Views:
         view = self.located[number]
         return self._ideal[view.camera].resample(stretch_fine(gray(self.capture.fine_image(view.frame, view.camera))))
 
-    def _with_sources(self, number: int) -> tuple[int, ...]:
+    def _sources_of(self, number: int) -> tuple[int, ...]:
         return number, *self.located[number].sources
 
     def _prepare_match(self, number: int) -> Match:
         """A view and its sources, ready to be matched; the view is the first of them."""
-        of, view = self._with_sources(number), self.located[number]
+        of, view = self._sources_of(number), self.located[number]
         cameras = {
             _name(k): replace(self.located[k].mounted, camera=self._ideal[self.located[k].camera].camera) for k in of
         }
@@ -108,7 +108,7 @@ class _Views:
     def _measure_view(self, number: int, matched: Mapping[int, _Matched]) -> Measured:
         """What was matched of a view."""
         view = self.located[number]
-        arrays = read_arrays(matched[number].file, remedy="give the command again: it is made anew")
+        arrays = read_arrays(matched[number].file, remedy="run the same command again to recreate it")
         grid = coarser(self._ideal[view.camera].camera, self.options.grid_px)
         depth_mm, sigma_mm = (arrays[name].astype(np.float64) for name in ("depth_mm", "sigma_mm"))
         return Measured(grid, view.mounted.cam_from_rig, depth_mm, sigma_mm, arrays["begun"], arrays["planes"])
@@ -119,7 +119,7 @@ class _Views:
 
     def match(self, stage: Stage, number: int) -> tuple[int, _Matched]:
         """Depth of a view, before the checks."""
-        of = [self.located[k] for k in self._with_sources(number)]
+        of = [self.located[k] for k in self._sources_of(number)]
         images = [self.capture.source.digest(view.frame.name, view.camera) for view in of]
         inputs = {"images": digest_of(images), "views": digest_of([(each.mounted, each.depth_range_mm) for each in of])}
         file = stage.folder / f"{of[0].frame.name}.{of[0].camera}.npz"
@@ -133,7 +133,7 @@ class _Views:
         others = self._others(number, matched)
         one = self._measure_view(number, matched)
         beside = [self._measure_view(other, matched) for other in others]
-        agreed = agreed_planes(one, beside, view_resolution(self.located, number), self.options.confidence)
+        agreed = consistent_planes(one, beside, view_resolution(self.located, number), self.options.confidence)
         if agreed is None:
             return number, matched[number]
         known: Float[np.ndarray, "h w 6"] = agreed
@@ -155,7 +155,7 @@ class _Views:
 
     def _depth_map(self, matched: Mapping[int, _Matched], number: int) -> DepthMap:
         view, ideal = self.located[number], self._ideal[self.located[number].camera]
-        checked = checked_depth_map(
+        checked = filter_depth_map(
             self._measure_view(number, matched),
             [self._measure_view(other, matched) for other in self._others(number, matched)],
             self.capture.image(view.frame, view.camera),

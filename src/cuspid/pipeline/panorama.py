@@ -34,17 +34,17 @@ from cuspid.motion.location import MotionOptions
 from cuspid.motion.monocular.single import (
     SingleMotion,
     SingleOptions,
+    count_observations,
     locate_single,
-    loose_notes,
     refine_on_surface,
-    with_observations,
+    weak_stretch_notes,
 )
 from cuspid.motion.rig_film import (
     film_options,
     locate_rig_film,
-    of_camera,
     refine_rig_on_surface,
     surface_patches,
+    trajectory_of_camera,
 )
 from cuspid.runtime.errors import InputError, ReconstructionError
 from cuspid.runtime.image_files import as_8_bits, common_brightening
@@ -70,9 +70,9 @@ __all__ = [
     "MeshViewOptions",
     "StitchOptions",
     "film",
+    "require_content",
     "stitch",
     "stitch_rig",
-    "that_show_something",
     "view_mesh",
 ]
 
@@ -119,14 +119,14 @@ def stitch(
     if isinstance(frames, Capture):
         return (stitch_rig(frames, options, progress=progress),)
     if options.method == "thesis":
-        method = load_plugin("cuspid.stitching", "thesis", asked="--method thesis", distribution="cuspid-thesis")
+        method = load_plugin("cuspid.stitching", "thesis", requested="--method thesis", distribution="cuspid-thesis")
         panoramas = method(frames, examination=options.examination, progress=progress)
-        return that_show_something(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
+        return require_content(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(frames, options.motion, progress=progress)
     brighter = common_brightening(map(frames.fine_image, range(len(frames))[_metered(len(frames))]))
     notes = (*frames.notes, *motion.notes, *_brightness_notes(brighter))
     stitched = [_stitch_part(frames, motion, k, brighter, options, progress) for k in range(len(motion.parts))]
-    return that_show_something(
+    return require_content(
         replace(
             part,
             panorama=replace(part.panorama, part=number, parts=len(stitched), notes=(*notes, *part.panorama.notes)),
@@ -135,18 +135,25 @@ def stitch(
     )
 
 
-def that_show_something(parts: Iterable[Stitched]) -> tuple[Stitched, ...]:
+def require_content(parts: Iterable[Stitched]) -> tuple[Stitched, ...]:
     """The parts of a panorama. Raises ReconstructionError where the pictures of all of them are as good as empty."""
     made = tuple(parts)
     if any(part.panorama.covered.mean() > _LEAST_COVERED for part in made):
         return made
-    shared = [_shared_points(part.motion) for part in made if part.motion is not None]
+    shared = [_median_shared_points(part.motion) for part in made if part.motion is not None]
     found = f", as neighbours share only {max(shared):.0f} points" if shared and max(shared) < _ENOUGH_SHARED else ""
     placed = sum(frame.used for part in made for frame in part.panorama.frames)
     raise ReconstructionError(
         f"stitch: the {placed} frames that were placed give no picture{found}; take them so that each overlaps the one "
         "before by at least half"
     )
+
+
+def _median_shared_points(motion: SparseModel) -> float:
+    """How many points a frame has in common with the one before (median)."""
+    tracks = motion.tracks
+    seen = [set(tracks.point_index[tracks.frame_index == number].tolist()) for number in range(len(motion.frames))]
+    return float(np.median([len(before & after) for before, after in pairwise(seen)] or [0]))
 
 
 def _metered(images: int) -> slice:
@@ -157,13 +164,6 @@ def _metered(images: int) -> slice:
 def _brightness_notes(brighter: float) -> Iterator[str]:
     if brighter > 1:
         yield f"the images are dark, and have more than 8 bits: they are shown {brighter:.1f} times brighter"
-
-
-def _shared_points(motion: SparseModel) -> float:
-    """How many points a frame has in common with the one before (median)."""
-    tracks = motion.tracks
-    seen = [set(tracks.point_index[tracks.frame_index == number].tolist()) for number in range(len(motion.frames))]
-    return float(np.median([len(before & after) for before, after in pairwise(seen)] or [0]))
 
 
 def _stitch_part(
@@ -190,9 +190,9 @@ def _stitch_part(
         else:
             shown = find_surface_again(shown, refined, read, options, progress=progress)
     made = orthophoto(
-        shown, with_observations(motion.frames_of(number), shown.motion), read, options, progress=progress
+        shown, count_observations(motion.frames_of(number), shown.motion), read, options, progress=progress
     )
-    loose = loose_notes(made.panorama.frames)
+    loose = weak_stretch_notes(made.panorama.frames)
     return replace(made, panorama=replace(made.panorama, notes=(*notes, *made.panorama.notes, *loose)))
 
 
@@ -206,7 +206,7 @@ def stitch_rig(capture: Capture, options: StitchOptions = StitchOptions(), *, pr
     if options.method != "ortho":
         raise InputError("stitch: --method thesis takes the images of one camera; give the folder of one camera")
     if options.scale != ScaleOptions():
-        raise InputError("stitch: the cameras of the handpiece tell the scale; leave out --scale")
+        raise InputError("stitch: the cameras of the handpiece set the scale; leave out --scale")
     capture = replace(capture, handpiece=NominalOptions().for_handpiece(capture.handpiece).fill(capture.handpiece))
     found = locate_rig_film(capture, options.rig, options.motion, progress=progress)
     scene = _RigScene(unroll_capture(capture, found), found, options)
@@ -221,7 +221,7 @@ def stitch_rig(capture: Capture, options: StitchOptions = StitchOptions(), *, pr
     uses = _uses(capture, scene.found, scene.camera)
     made = orthophoto(shown, uses, scene.read, options, progress=progress)
     noted = (*_scale_notes(scene.found, scene.camera), *scene.found.notes, *_brightness_notes(scene.brighter), *notes)
-    return that_show_something([replace(made, panorama=replace(made.panorama, notes=noted))])[0]
+    return require_content([replace(made, panorama=replace(made.panorama, notes=noted))])[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +241,7 @@ class _RigScene:
     def path(self) -> SparseModel:
         """The trajectory of that camera."""
         has = {frame.name for frame in self.capture.frames if self.camera in frame.cameras}
-        return of_camera(self.found, self.camera, has)
+        return trajectory_of_camera(self.found, self.camera, has)
 
     @computed_once
     def brighter(self) -> float:
@@ -269,7 +269,7 @@ class _RigScene:
         surface = shown.dense.mesh().transformed(into_occlusal_frame(self.path, shown.motion).inverse())
         options = self.options
         return refine_rig_on_surface(
-            *(self.found, surface, self.capture, options.rig, options.motion, options.rig_patches), progress=progress
+            self.found, surface, self.capture, options.rig, options.motion, options.rig_patches, progress=progress
         )
 
 
@@ -285,13 +285,13 @@ def _facing_down(found: Reconstruction) -> str:
 def _uses(capture: Capture, found: Reconstruction, camera: str) -> tuple[FrameUse, ...]:
     """What became of the frames in the picture of a camera."""
     reasons = {each.what.removeprefix("frame "): each.reason for each in found.dropped}
-    told = {
+    observations = {
         frame.name: None
         if camera in frame.cameras and frame.name in found.rig_from_world
         else reasons.get(frame.name, f"no image of camera {camera}")
         for frame in capture.frames
     }
-    return tuple(FrameUse(name=name, used=reason is None, reason=reason) for name, reason in told.items())
+    return tuple(FrameUse(name=name, used=reason is None, reason=reason) for name, reason in observations.items())
 
 
 def _scale_notes(found: Reconstruction, camera: str) -> Iterator[str]:

@@ -1,6 +1,6 @@
-"""From photographs of one camera to a capture whose frames are located: what the dense stereo takes.
+"""Turns photographs of one camera into a capture with located frames: the input of dense stereo.
 
-A photograph is a frame that one camera took; the rig frame is that of the camera. Where nothing tells the scale, all
+A photograph is a frame that one camera took; the rig frame is that of the camera. Where the scale is unknown, all
 lengths are in a unit of which the median distance of the surface has :data:`UNITS`, whatever the names of fields say,
 and the result says so (``has_scale``).
 """
@@ -47,8 +47,8 @@ __all__ = [
     "PhotographOptions",
     "depth_range",
     "find_scale",
-    "handed_over",
     "locate",
+    "to_capture",
 ]
 
 UNITS = 100.0
@@ -94,7 +94,7 @@ def locate(
             model = locate_photographs(photographs, options, progress=progress)
         else:
             model = take_photograph_poses(photographs, colmap_model, options, progress=progress)
-        _write(folder, handed_over(model, photographs, find_scale(model, photographs, scale, progress=progress)))
+        _write(folder, to_capture(model, photographs, find_scale(model, photographs, scale, progress=progress)))
 
     names = (*RECONSTRUCTION_FILES, "scale.json", "points.ply")
     stage.make(inputs, [folder / name for name in names], write)
@@ -104,7 +104,7 @@ def locate(
 def find_scale(
     model: PhotoModel, photographs: Photographs, options: PhotoScaleOptions, *, progress: Progress = silent
 ) -> Scale | None:
-    """What tells how large things are, None where nothing does: a board before distances."""
+    """What sets the scale; None where nothing does: a board before distances."""
     board = options.board
     if board is not None:
         sightings = _sightings(photographs, board, progress)
@@ -114,7 +114,7 @@ def find_scale(
     return None
 
 
-def handed_over(model: PhotoModel, photographs: Photographs, scale: Scale | None) -> LocatedPhotographs:
+def to_capture(model: PhotoModel, photographs: Photographs, scale: Scale | None) -> LocatedPhotographs:
     """A model as a capture and its reconstruction, in millimetres, or without a scale."""
     own = model.scaled(UNITS / float(np.median(model.depths)) if scale is None else scale.mm_per_unit)
     rig = Rig({name: MountedCamera(camera, Rigid3.identity()) for name, camera in own.cameras.items()})
@@ -189,8 +189,8 @@ def _write(folder: Path, located: LocatedPhotographs) -> None:
     if found.tracks is not None:
         comment = "lengths in mm" if found.has_scale else storage.NO_SCALE
         storage.write_points(folder / "points.ply", found.tracks.points, found.tracks.colors, comment)
-    told = {"scale": "unknown"} if scale is None else {"scale": "known", **asdict(scale)}
-    storage.write_json(folder / "scale.json", told)
+    record = {"scale": "unknown"} if scale is None else {"scale": "known", **asdict(scale)}
+    storage.write_json(folder / "scale.json", record)
     storage.write_reconstruction(folder, found, capture.handpiece)
 
 

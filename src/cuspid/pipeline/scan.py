@@ -170,19 +170,19 @@ def find_poses(
     """The poses of the frames, and the calibration adjusted to the images (first part of :func:`reconstruct`)."""
     options = resolve_options(options)
     nominal = options.calibration == "refined" and is_nominal(capture.handpiece)
-    capture = replace(capture, handpiece=as_known(capture.handpiece, options))
+    capture = replace(capture, handpiece=apply_uncertainty(capture.handpiece, options))
     if colmap_model is not None:
         return take_poses(capture, colmap_model, folder / "motion")
     if resolve_signal(capture, options) == "shading":
         depths = _shaded_depth(capture, folder, options, progress)
-        made_from, how = depths.digest, options.surfaces
-        found = locate_by_surfaces(capture, depths, made_from, folder / "motion", how, progress=progress)
+        made_from, tracking = depths.digest, options.surfaces
+        found = locate_by_surfaces(capture, depths, made_from, folder / "motion", tracking, progress=progress)
         return replace(found, notes=(*_unused_shutters(capture, "shading"), *found.notes))
     doubts = _unused_shutters(capture, "texture")
     if options.own_images:
         cache = folder / "motion" / "cache"
         doubts += require_own_images(capture, options.tracking, cache=cache, progress=progress)
-    capture, notes = _hold_what_fits(capture, nominal, folder / "motion", options, progress)
+    capture, notes = _hold_consistent_calibration(capture, nominal, folder / "motion", options, progress)
     found = locate(capture, folder / "motion", options.tracking, options.motion, progress=progress)
     return replace(found, notes=(*doubts, *notes, *found.notes))
 
@@ -196,11 +196,11 @@ def _unused_shutters(capture: Capture, signal: Signal) -> tuple[str, ...]:
     if signal == "shading":
         return (f"{unused}: on plain surfaces depth comes before the motion, which they depend on",)
     if not is_rolling(capture.handpiece.rig, [frame.name for frame in capture.frames]):
-        return (f"{unused}: the frames' names are no numbers in order, and do not tell their times",)
+        return (f"{unused}: the frames' names are not ascending numbers, so their times are unknown",)
     return ()
 
 
-def _hold_what_fits(
+def _hold_consistent_calibration(
     capture: Capture, nominal: bool, folder: Path, options: ReconstructionOptions, progress: Progress
 ) -> tuple[Capture, tuple[str, ...]]:
     """One instant with the calibration held, and a note, where that states no uncertainty and the images do not
@@ -210,12 +210,12 @@ def _hold_what_fits(
     offset_px = epipolar_offset_px(capture, options.tracking, cache=folder / "cache", progress=progress)
     if offset_px is not None and offset_px > _FITS_PX:
         return capture, ()
-    told = (
+    finding = (
         "too little is matched to refine it"
         if offset_px is None
         else f"its epipolar lines fit within {offset_px:.1f} px"
     )
-    note = f"calibration: held as in the file, which states no uncertainty: {told}"
+    note = f"calibration: kept as in the file, which states no uncertainty: {finding}"
     return replace(capture, handpiece=without_covariances(capture.handpiece)), (note,)
 
 
@@ -238,9 +238,15 @@ def surface(
     else:
         depths = _textured_depth(of_size, found, detail, folder, options, progress)
     trim_heap()
-    how = fusion_for(of_size.handpiece, options), options.cleaning, options.sharp_edges
     return fuse(
-        *(depths, depths.digest, _poses(found, depths), detail, folder, *how),
+        depths,
+        depths.digest,
+        _poses(found, depths),
+        detail,
+        folder,
+        fusion_for(of_size.handpiece, options),
+        options.cleaning,
+        options.sharp_edges,
         expected=found.expectation,
         has_scale=found.has_scale,
         progress=progress,
@@ -257,7 +263,7 @@ def resolve_signal(capture: Capture, options: ReconstructionOptions) -> Signal:
 
 
 def resize_for_quality(capture: Capture, options: ReconstructionOptions) -> Capture:
-    """With images of the size that depth is measured from: photographs of many megapixels are reduced."""
+    """The capture with images of the size that depth is measured from: photographs of many megapixels are reduced."""
     if options.quality == "draft":
         capture = capture.halved()
     while options.quality != "fine" and _largest_px(capture) > _MOST_PX[options.quality]:
@@ -302,7 +308,10 @@ def _textured_depth(
         return measure_view_depth(capture, found, folder / "depth", stereo, progress=progress)
     agreement_mm = options.fusion.agreement * detail
     depths = measure_enough_depth(
-        *(capture, found, folder / "depth", stereo),
+        capture,
+        found,
+        folder / "depth",
+        stereo,
         agreement_mm=agreement_mm,
         left_share=options.left_share,
         progress=progress,
@@ -311,10 +320,15 @@ def _textured_depth(
         return depths
     holes = None
     if found.tracks is not None and options.across.small_holes is not False and options.across.left_share != 0:
-        located = depths, depths.digest, _poses(found, depths)
-        holes = find_holes(*located, detail, folder, fusion_for(handpiece, options), progress=progress)
+        poses, fusion = _poses(found, depths), fusion_for(handpiece, options)
+        holes = find_holes(depths, depths.digest, poses, detail, folder, fusion, progress=progress)
     return depths | measure_depth_across(
-        *(capture, found, depths, folder / "depth-across", options.across, stereo),
+        capture,
+        found,
+        depths,
+        folder / "depth-across",
+        options.across,
+        stereo,
         agreement_mm=agreement_mm,
         min_maps=options.fusion.min_maps,
         holes=holes,
@@ -337,7 +351,7 @@ def fusion_for(handpiece: Handpiece, options: ReconstructionOptions) -> FusionOp
 
 
 def resolve_options(options: ReconstructionOptions) -> ReconstructionOptions:
-    """With what the quality decides, where nothing else was asked for."""
+    """The options with everything that the quality decides filled in, unless given."""
     if options.left_share is None:
         left = {"draft": _DRAFT_LEFT_SHARE, "standard": _LEFT_SHARE, "fine": 0.0}
         options = replace(options, left_share=left[options.quality])
@@ -369,7 +383,7 @@ def _resolve_draft(options: ReconstructionOptions) -> ReconstructionOptions:
     return replace(options, tracking=tracking, stereo=stereo, across=across, fusion=fusion)
 
 
-def as_known(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
+def apply_uncertainty(handpiece: Handpiece, options: ReconstructionOptions) -> Handpiece:
     """The handpiece with the uncertainty that is assumed for it."""
     if options.calibration == "fixed":
         return without_covariances(handpiece)
@@ -407,8 +421,8 @@ def evaluate(
     *,
     sigma_um: Float[np.ndarray, "v"] | None = None,
 ) -> Trueness:
-    """Trueness of a mesh in any pose. Evaluated is the surface that at least two cameras could see, which the ground
-    truth of a simulation tells; of a jaw or a mesh all of it.
+    """Trueness of a mesh in any pose. The evaluation covers the surface that at least two cameras could see, which the
+    ground truth of a simulation states; of a jaw or a mesh all of it.
 
     ``sigma_um``: the standard deviation that the scan predicts for each of its vertices, along its normal. Raises
     InputError where the two do not belong together or nothing is left to compare.
@@ -418,12 +432,12 @@ def evaluate(
     found = measure_deviation(
         scan, against.jaw, options, scannable=against.scannable, crown=against.crown, sigma_um=sigma_um
     )
-    told = (*(f"scan: {note}" for note in facing), *(() if against is reference else against.notes))
-    return replace(found, notes=(*told, *found.notes))
+    notes = (*(f"scan: {note}" for note in facing), *(() if against is reference else against.notes))
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def reference_of(truth: GroundTruth | Jaw | Mesh) -> Reference:
-    """What a scan is compared with, of what is known of its object: a mesh, in any pose, tells least, the ground truth
+    """What a scan is compared with, of what is known of its object: a mesh, in any pose, says least, the ground truth
     of a simulation most."""
     if isinstance(truth, GroundTruth):
         seen = scannable(truth)

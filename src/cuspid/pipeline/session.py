@@ -81,7 +81,7 @@ class Session:
         settled = pipeline.resolve_options(self._options)
         require_stereo(handpiece, settled.stereo.pairing)
         self._settled, self._folder = settled, Path(folder)
-        self._capture = Capture(handpiece=pipeline.as_known(handpiece, settled), frames=(), source=source)
+        self._capture = Capture(handpiece=pipeline.apply_uncertainty(handpiece, settled), frames=(), source=source)
         self._given = handpiece
         self._sized = pipeline.resize_for_quality(self._capture, settled)
         self._estimator = DepthEstimator(self._sized.handpiece, settled.stereo)

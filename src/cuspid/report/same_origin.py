@@ -44,7 +44,7 @@ def is_own(host: str | None, origin: str | None, bound: str) -> bool:
     """Whether a request with such headers comes from a page of the server that is bound to an address.
 
     Host must be an address, ``localhost``, this machine's name, or what the server is bound to: not a name that others
-    hand out. Origin, which browsers tell for every WebSocket, must be the same host and port.
+    hand out. Origin, which browsers send with every WebSocket, must be the same host and port.
     """
     try:
         name, page = urlsplit(f"//{host or ''}").hostname, urlsplit(origin or "").netloc

@@ -1,7 +1,7 @@
 """Image files: read by their content, whole, upright, and as 8 bits whatever they store.
 
-Cameras of 10 and 12 bits often store them in 16. How many bits the images of a folder use is told by the largest value
-of all of them: one alone may just be dark.
+Cameras of 10 and 12 bits often store them in 16. The largest value in the images of a folder shows how many bits they
+use: one alone may just be dark.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def full_range_grey(image: Pixels) -> UInt8[np.ndarray, "h w"]:
 
 def brighten(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """A dark image stretched to the whole range: the contrast of a keypoint is a share of it. Others as they are."""
-    factor = _brightening(grey)
+    factor = _brightness_factor(grey)
     return as_8_bits(grey) if factor == 1 else np.asarray(cv2.convertScaleAbs(grey, alpha=factor), dtype=np.uint8)
 
 
@@ -99,18 +99,18 @@ def stretch_fine(
 ) -> UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]:
     """A dark image of more than 8 bits as bright as :func:`brighten` makes it, unrounded and unclipped; others as they
     are."""
-    return grey if grey.dtype == np.uint8 else grey * np.float32(_brightening(grey))
+    return grey if grey.dtype == np.uint8 else grey * np.float32(_brightness_factor(grey))
 
 
 def common_brightening(images: Iterable[Pixels]) -> float:
     """How many times brighter images of one film can be, which are compared with each other: as :func:`brighten` makes
     all but the brightest tenth of them, if they have more than 8 bits."""
     greys = (np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in images)
-    factors = [1.0 if grey.dtype == np.uint8 else _brightening(grey) for grey in greys]
+    factors = [1.0 if grey.dtype == np.uint8 else _brightness_factor(grey) for grey in greys]
     return float(np.quantile(factors, _CLIPPED_SHARE, method="higher")) if factors else 1.0
 
 
-def _brightening(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> float:
+def _brightness_factor(grey: UInt8[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]) -> float:
     """How many times brighter a dark image can be; 1 for others."""
     bright, brightest = np.percentile(grey[::2, ::2], _BRIGHT_PERCENTILES).tolist()
     return 255 / bright if 0 < bright <= brightest < _DARK_DN else 1.0
@@ -310,8 +310,8 @@ def _as_levels(path: Path, values: Shaped[np.ndarray, "h w"]) -> UInt16[np.ndarr
 def _bare_png(path: Path) -> bytes:
     """A PNG with its pixels only: of anything else, libpng may complain to the terminal."""
     data = read_bytes(path, "image")
-    wanted = (data[at - 8 : at + length + 4] for kind, _, at, length in _chunks(io.BytesIO(data)) if kind in _PIXELS)
-    return b"".join([_PNG_START, *wanted])
+    chunks = (data[at - 8 : at + length + 4] for kind, _, at, length in _chunks(io.BytesIO(data)) if kind in _PIXELS)
+    return b"".join([_PNG_START, *chunks])
 
 
 _lock = Lock()

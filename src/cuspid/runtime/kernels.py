@@ -28,7 +28,7 @@ _LONGEST_WAIT_S = 120.0
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Decorator: compile a function when it is first called; in each process anew where nothing can be kept on disk
+    """Decorator: compile a function when it is first called; in each process again where nothing can be cached on disk
     (``NUMBA_CACHE_DIR`` names a place). ``options`` are those of ``numba.njit``."""
     if function is None:
         return partial(kernel, **options)
@@ -39,11 +39,11 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         except RuntimeError:  # nowhere to keep it: a read-only installation without a home
             return compiled
         compiled._cache = cache  # type: ignore[attr-defined]
-        compiled.compile = _one_at_a_time(compiled.compile, cache)  # type: ignore[method-assign]
+        compiled.compile = _serialize_compilation(compiled.compile, cache)  # type: ignore[method-assign]
     return compiled
 
 
-def _one_at_a_time(compile_for: Callable[..., Any], cache: _KernelCache) -> Callable[..., Any]:
+def _serialize_compilation(compile_for: Callable[..., Any], cache: _KernelCache) -> Callable[..., Any]:
     """``Dispatcher.compile``, which takes what is on disk or compiles and stores it, in one process at a time."""
 
     @wraps(compile_for)

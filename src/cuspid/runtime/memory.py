@@ -1,7 +1,8 @@
 """What the C library does with memory that is freed. Without glibc, nothing here has an effect.
 
-By default every array of more than some hundred kilobytes is mapped anew, and the system clears its pages: over an arch
-this took a twentieth of all time. Kept memory is used again at once; but what one stage leaves, another may not need.
+By default every array of more than some hundred kilobytes is mapped afresh, and the system clears its pages: over an
+arch this took a twentieth of all time. Kept memory is used again at once; but what one stage leaves, another may not
+need.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _KEPT = 1 << 30
 
 
 def keep_freed() -> None:
-    """From now on, keep what is freed for what is made next."""
+    """From now on, keep freed memory for later allocations."""
     if _LIBC is not None and hasattr(_LIBC, "mallopt"):
         _LIBC.mallopt(_M_MMAP_THRESHOLD, _MAPPED_FROM)
         _LIBC.mallopt(_M_TRIM_THRESHOLD, _KEPT)

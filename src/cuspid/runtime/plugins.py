@@ -12,11 +12,15 @@ from typing import Any, Literal
 from cuspid.runtime.errors import InputError
 
 
-def load_plugin(group: Literal["cuspid.verbs", "cuspid.stitching"], name: str, *, asked: str, distribution: str) -> Any:
+def load_plugin(
+    group: Literal["cuspid.verbs", "cuspid.stitching"], name: str, *, requested: str, distribution: str
+) -> Any:
     """What an installed distribution offers under a name.
 
-    ``asked`` is what the user typed. Raises InputError, naming the distribution to install, where there is none.
+    ``requested`` is what the user typed. Raises InputError, naming the distribution to install, where there is none.
     """
     for entry in entry_points(group=group, name=name):
         return entry.load()
-    raise InputError(f"{asked}: comes with the distribution {distribution}, which is not installed (see the README)")
+    raise InputError(
+        f"{requested}: comes with the distribution {distribution}, which is not installed (see the README)"
+    )

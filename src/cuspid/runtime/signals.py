@@ -11,7 +11,7 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
-def handlers_kept() -> Iterator[None]:
+def preserve_handlers() -> Iterator[None]:
     """Nothing that is loaded in the block leaves signal handlers behind; a signal that arrives meanwhile is delivered
     at its end. Only the main thread handles signals: in other threads nothing happens."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "pthread_sigmask"):

@@ -110,9 +110,9 @@ def printable(text: str) -> str:
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
-def one_line(said: object) -> str:
+def one_line(message: object) -> str:
     """A message from a library or a file, cut to one short line."""
-    return quote(" ".join(str(said).split()), longest=120)[1:-1]
+    return quote(" ".join(str(message).split()), longest=120)[1:-1]
 
 
 def quote(value: object, *, longest: int = _SHOWN) -> str:

@@ -27,7 +27,7 @@ _Result = TypeVar("_Result")
 _BATCH_PER_CORE = 8
 
 START_METHOD: Literal["fork", "spawn"] = "fork" if sys.platform == "linux" else "spawn"
-"""How processes begin: as a copy of this one, with all that it has, or anew, with what they are given
+"""How processes begin: as a copy of this one, with all that it has, or empty, with what they are given
 (:func:`pickle_fields`). Elsewhere than on Linux, system libraries do not survive a copy."""
 
 
@@ -48,7 +48,7 @@ class computed_once(cached_property[_Result]):
 def core_numbers(thread: int = 0) -> list[int]:
     """The numbers of the cores that a thread may run on: those of the calling thread, or of a process given its id.
 
-    All cores if the system does not tell.
+    All cores if the system does not say.
     """
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(thread))
@@ -111,7 +111,7 @@ def map_batches(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Ite
         yield map_in_threads(work, batch)
 
 
-def in_shares(work: Callable[[int, int], None]) -> None:
+def run_in_shares(work: Callable[[int, int], None]) -> None:
     """``work(share, shares)``, which must release the GIL, for each of as many shares as there are usable cores, in
     threads."""
     shares = usable_cores()
@@ -132,7 +132,7 @@ def map_slices(
 
 
 def pickle_fields(value: object) -> bytes:
-    """A value for a process that begins anew, which has it back by ``pickle.loads``. Of frozen values the fields are
+    """A value as bytes for a new process, which restores it by ``pickle.loads``. Of frozen values the fields are
     packed, and not what was computed from them: trees and scenes of libraries cannot leave their process."""
     stream = io.BytesIO()
     _Packer(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)

@@ -51,9 +51,10 @@ class Material:
     applied: bool = False
     """Whether the texture is sprayed or painted on, as fine as the cameras need it, rather than the surface's own."""
 
-    def seen_by(self, footprint_mm: float) -> Material:
-        """With an applied texture that suits cameras whose pixels have this footprint: the one for 12 um, unless its
-        finest octave has less than 1 px or more than 25 px there; then it is coarser or finer by whole octaves."""
+    def at_footprint(self, footprint_mm: float) -> Material:
+        """The material with an applied texture that suits cameras whose pixels have this footprint: the one for 12 um,
+        unless its finest octave has less than 1 px or more than 25 px there; then it is coarser or finer by whole
+        octaves."""
         octaves = np.log2(footprint_mm / _SUITED_MM)
         if not self.applied or abs(octaves) < _ALIKE_OCTAVES:
             return self
@@ -72,9 +73,9 @@ class Appearance:
     marked: bool = False
     """Whether teeth and gum bear what real ones do (:func:`cuspid.simulation.marks.natural_marks`)."""
 
-    def seen_by(self, footprint_mm: float) -> Appearance:
-        """Both materials as :meth:`Material.seen_by`."""
-        return replace(self, enamel=self.enamel.seen_by(footprint_mm), gum=self.gum.seen_by(footprint_mm))
+    def at_footprint(self, footprint_mm: float) -> Appearance:
+        """Both materials as :meth:`Material.at_footprint`."""
+        return replace(self, enamel=self.enamel.at_footprint(footprint_mm), gum=self.gum.at_footprint(footprint_mm))
 
 
 _SUITED_MM, _ALIKE_OCTAVES = 0.012, 2.3
@@ -253,16 +254,23 @@ def gradient_noise(x, y, z):
 
 @kernel(fastmath=True)
 @no_type_check
+def _noise(x, y, z):
+    """:func:`gradient_noise`, compiled once for all callers: in four places of one kernel it takes numba 8 s."""
+    return gradient_noise(x, y, z)
+
+
+@kernel(fastmath=True)
+@no_type_check
 def stipple_normal(normal, point, height_mm, noise_from_jaw):
     """The unit normal of a surface on which a noise of this height lies (bump mapping; Blinn 1978)."""
     m = noise_from_jaw
     x = m[0, 0] * point[0] + m[0, 1] * point[1] + m[0, 2] * point[2] + m[0, 3]
     y = m[1, 0] * point[0] + m[1, 1] * point[1] + m[1, 2] * point[2] + m[1, 3]
     z = m[2, 0] * point[0] + m[2, 1] * point[1] + m[2, 2] * point[2] + m[2, 3]
-    here, scale = gradient_noise(x, y, z), height_mm / (GRADIENT_NOISE_SD * _STEP)
-    u = scale * (gradient_noise(x + _STEP, y, z) - here)
-    v = scale * (gradient_noise(x, y + _STEP, z) - here)
-    w = scale * (gradient_noise(x, y, z + _STEP) - here)
+    here, scale = _noise(x, y, z), height_mm / (GRADIENT_NOISE_SD * _STEP)
+    u = scale * (_noise(x + _STEP, y, z) - here)
+    v = scale * (_noise(x, y + _STEP, z) - here)
+    w = scale * (_noise(x, y, z + _STEP) - here)
     slope = (
         m[0, 0] * u + m[1, 0] * v + m[2, 0] * w,
         m[0, 1] * u + m[1, 1] * v + m[2, 1] * w,

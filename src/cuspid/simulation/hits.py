@@ -148,7 +148,7 @@ def _meets(surface, rays, ray, candidates):
 @kernel(fastmath=True)
 @no_type_check
 def dot(a, b):
-    """Of two vectors."""
+    """Dot product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

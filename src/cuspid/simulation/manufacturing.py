@@ -63,10 +63,10 @@ def sample_built(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     """One of the handpieces that are built to the tolerances; the drawn one if there are none."""
     rng = np.random.default_rng([options.manufacturing_seed, 3])
     placed = with_cameras(drawn, lambda mounted: _draw_error(mounted, options.tolerances, rng))
-    return _lit_anew(_exposing_anew(placed, options), options)
+    return _vary_lights(_vary_sensors(placed, options), options)
 
 
-def _exposing_anew(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
+def _vary_sensors(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     """With a sensor of its own for each camera, where they are not all alike."""
     if not (options.manufacturing_gain_pct or options.manufacturing_falloff_pct or options.manufacturing_gamma_pct):
         return drawn
@@ -87,7 +87,7 @@ def _sensor(drawn: Sensor, options: ManufacturingOptions, rng: np.random.Generat
     )
 
 
-def _lit_anew(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
+def _vary_lights(drawn: Handpiece, options: ManufacturingOptions) -> Handpiece:
     """With lights that are not quite where, and not quite as bright as, they were drawn."""
     if not (options.manufacturing_led_um or options.manufacturing_led_power_pct):
         return drawn

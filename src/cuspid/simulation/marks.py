@@ -63,7 +63,7 @@ def no_marks(mesh: Mesh) -> Marks:
 
 
 def natural_marks(jaw: Jaw, seed: int) -> Marks:
-    """Those of real teeth; ``seed`` selects which fissures are stained and which teeth are filled."""
+    """Marks as on real teeth; ``seed`` selects which fissures are stained and which teeth are filled."""
     rng, mesh = np.random.default_rng([seed, 15]), jaw.mesh
     dentine = _ramp(hollow_mm(mesh, _BROAD_MM), *_HOLLOW_MM)
     stain = _ramp(hollow_mm(mesh, _FINE_MM), *_FISSURE_MM) * _patches(mesh, rng) * _far_from_gum(jaw)

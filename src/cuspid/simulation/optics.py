@@ -90,7 +90,7 @@ class OpticsOptions(Options):
 
     @property
     def resolved(self) -> Optics:
-        """With the values of the preset where no others are given."""
+        """The optics with the values of the preset where no others are given."""
         preset = vars({"ideal": IDEAL, "clinical": CLINICAL}[self.optics])
         return Optics(
             **{name: value if (own := getattr(self, name)) is None else own for name, value in preset.items()}
@@ -171,9 +171,9 @@ def encode_image(image: UInt8[np.ndarray, "h w 3"], optics: Optics) -> UInt8[np.
         mosaic[::2, ::2], mosaic[1::2, 1::2] = image[::2, ::2, 0], image[1::2, 1::2, 2]
         image = np.asarray(cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB), dtype=np.uint8)
     if optics.jpeg_quality is not None:
-        how = [cv2.IMWRITE_JPEG_QUALITY, optics.jpeg_quality]
-        how += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422]
-        coded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), how)[1]
+        parameters = [cv2.IMWRITE_JPEG_QUALITY, optics.jpeg_quality]
+        parameters += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422]
+        coded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), parameters)[1]
         decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), dtype=np.uint8)
         image = np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), dtype=np.uint8)
     return image

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from cuspid.geometry import Rigid3, read_only
-from cuspid.geometry.gloss import coat, leaving
+from cuspid.geometry.gloss import coat, transmittance
 from cuspid.model.camera import Camera
 from cuspid.model.capture import Frame
 from cuspid.model.jaw import Jaw
@@ -94,10 +94,15 @@ class Scene:
         mesh = self.jaw.mesh
         marks = natural_marks(self.jaw, self.seed) if self.appearance.marked else no_marks(mesh)
         return ShadedMesh(
-            mesh.vertices,
-            read_only(mesh.faces),  # arrays from another process are writable: the shading would be compiled once more
-            *(mesh.face_normals, mesh.vertex_normals, face_materials(self.jaw)),
-            *(marks.colours, marks.shares, marks.stippled),
+            vertices=mesh.vertices,
+            # Arrays from another process are writable: the shading would be compiled once more.
+            faces=read_only(mesh.faces),
+            face_normals=mesh.face_normals,
+            vertex_normals=mesh.vertex_normals,
+            materials=face_materials(self.jaw),
+            mark_colours=marks.colours,
+            marks=marks.shares,
+            stippled=marks.stippled,
         )
 
     @computed_once
@@ -258,14 +263,14 @@ def radiance_along(
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         own, firsts = slice(top * row, bottom * row), slice(top * row, (bottom + 1) * row, samples)
-        grid = trace(scene.jaw.mesh, _some(origins, firsts), directions[firsts])
-        given = scene.jaw.mesh, scene.surface, _some(origins, own), directions[own]
-        rays = first_hits(*given, grid, samples, width, moving=moving)
+        grid = trace(scene.jaw.mesh, _slice_origins(origins, firsts), directions[firsts])
+        begins = _slice_origins(origins, own)
+        rays = first_hits(scene.jaw.mesh, scene.surface, begins, directions[own], grid, samples, width, moving=moving)
         _add_light(scene, rays, grid, lights, below, out[top:bottom])
     return out
 
 
-def _some(origins: Float[np.ndarray, "#n 3"], which: slice) -> Float[np.ndarray, "#m 3"]:
+def _slice_origins(origins: Float[np.ndarray, "#n 3"], which: slice) -> Float[np.ndarray, "#m 3"]:
     return origins if len(origins) == 1 else origins[which]
 
 
@@ -284,10 +289,8 @@ def _add_light(
     points, materials = _places(rays, scene.surface)
     albedos = albedo(points, materials, scene.palette)
     _mark(rays, scene.surface, albedos)
-    _shade(
-        *(rays, albedos, scene.surface, scene.palette, lights),
-        *(chosen, counts, light, samples, below, out.reshape(-1, 3)),
-    )
+    pixels = out.reshape(-1, 3)
+    _shade(rays, albedos, scene.surface, scene.palette, lights, chosen, counts, light, samples, below, pixels)
 
 
 @kernel
@@ -389,7 +392,7 @@ def _shade(rays, albedos, surface, palette, lights, chosen, counts, light, sampl
             view = (direction[0] * inverse, direction[1] * inverse, direction[2] * inverse)
             scattered = albedo
             if palette.exit_index[m] > 1:
-                share = leaving(-dot(normal, view), palette.exit_index[m])
+                share = transmittance(-dot(normal, view), palette.exit_index[m])
                 scattered = (albedo[0] * share, albedo[1] * share, albedo[2] * share)
             for c in range(3):
                 out[pixel, c] += scattered[c] * light.ambient[n, c] / samples
@@ -401,8 +404,8 @@ def _shade(rays, albedos, surface, palette, lights, chosen, counts, light, sampl
             for k in range(len(lights.positions)):
                 if light.lit[n, k]:
                     towards, falloff = incoming(point, k, lights)
-                    surface_coat = palette.reflectance[m], palette.roughness[m], palette.saliva
-                    diffuse, glossy = _reflect(normal, view, towards, *surface_coat)
+                    reflectance, roughness = palette.reflectance[m], palette.roughness[m]
+                    diffuse, glossy = _reflect(normal, view, towards, reflectance, roughness, palette.saliva)
                     glossy *= lights.glare[k]
                     if spread:
                         diffuse = 0.0
@@ -419,7 +422,7 @@ def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
     reflectance = np.zeros(len(mesh.vertices))
     reflectance[mesh.faces] = scene.palette.reflectance[materials][:, None]
     heights = scene.palette.stipple_mm[1] * scene.surface.stippled
-    _entering(mesh.vertices, mesh.vertex_normals, heights, scene.palette, reflectance, lights, shares)
+    _add_entering_light(mesh.vertices, mesh.vertex_normals, heights, scene.palette, reflectance, lights, shares)
     lit = shares > NOTICEABLE * shares.sum(axis=1, keepdims=True)
     darken(lit, lit, mesh.occluded(*segments(mesh.vertices, lit, lights.positions)))
     return np.einsum("vl,lc->vc", np.where(lit, shares, 0.0), lights.intensities)
@@ -427,7 +430,7 @@ def _entering_light(scene: Scene, lights: Lamps) -> Float[np.ndarray, "v 3"]:
 
 @kernel(fastmath=True)
 @no_type_check
-def _entering(points, normals, heights, palette, reflectance, lights, shares):
+def _add_entering_light(points, normals, heights, palette, reflectance, lights, shares):
     """Fill in the share of each light that enters at each point, if nothing hides it."""
     for i in range(len(points)):
         normal = (normals[i, 0], normals[i, 1], normals[i, 2])
@@ -542,8 +545,8 @@ class _Worker:
 
     def __call__(self, task: tuple[Frame, str]) -> tuple[str, str]:
         frame, camera = task
-        how = self.poses[frame.name], self.gains[frame.lighting], self.motions[frame.name]
-        self.sink(frame.name, camera, render_image(self.scene, frame, camera, *how))
+        pose, gain, motion = self.poses[frame.name], self.gains[frame.lighting], self.motions[frame.name]
+        self.sink(frame.name, camera, render_image(self.scene, frame, camera, pose, gain, motion))
         return frame.name, camera
 
 
@@ -559,7 +562,9 @@ def _work(task: tuple[Frame, str]) -> tuple[str, str]:
     return _worker(task)
 
 
-def _in_order(frames: Sequence[Frame], skip: Callable[[str, str], bool], together: int) -> list[tuple[Frame, str]]:
+def _frame_by_frame(
+    frames: Sequence[Frame], skip: Callable[[str, str], bool], together: int
+) -> list[tuple[Frame, str]]:
     """All cameras of so many frames at a time, one after the other, for a process remembers the rays of the last."""
     numbered = [
         (index // together, camera, frame)
@@ -583,10 +588,10 @@ def render_capture(
     done.
 
     Embree holds the interpreter lock, so the work is distributed over processes. Forked ones trace rays in the scene
-    that the parent built (a forked child could not build one) and run kernels that the parent compiled; those that
-    begin anew build their own, and are given the ``sink``, which must then be picklable.
+    that the parent built (a forked child could not build one) and run kernels that the parent compiled; new ones build
+    their own, and are given the ``sink``, which must then be picklable.
     """
-    tasks = _in_order(frames, skip, _TOGETHER if scene.scattering else max(len(frames), 1))
+    tasks = _frame_by_frame(frames, skip, _TOGETHER if scene.scattering else max(len(frames), 1))
     if not tasks:
         return
     worker = _Worker(

@@ -1,4 +1,4 @@
-"""From linear light to the digital numbers of an 8-bit RGB image: falloff, gain, gamma, noise, rounding."""
+"""Converts linear light to the digital numbers of an 8-bit RGB image: falloff, gain, gamma, noise, rounding."""
 
 from __future__ import annotations
 

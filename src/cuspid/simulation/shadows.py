@@ -92,10 +92,10 @@ def illuminate(
     below, if there is one.
     """
     chosen, counts = _surfaces(rays.distances, samples)
-    points, light = _unhidden(surface, rays, chosen, counts, lights)
+    points, light = _unoccluded_light(surface, rays, chosen, counts, lights)
     asked = light.lit.copy()
-    places, seen = _seen_at_places(mesh, surface, grid, lights, width)
-    _agree(rays, chosen, samples, surface, lights, points, grid.distances, width, places, seen, light.lit, asked)
+    shadows = _trace_grid(mesh, surface, grid, lights, width)
+    _adopt_agreement(rays, chosen, samples, surface, lights, points, shadows, light.lit, asked)
     darken(light.lit, asked, mesh.occluded(*segments(points, asked, lights.positions)))
     return chosen, counts, light
 
@@ -121,7 +121,7 @@ def _surfaces(distances, samples):
     return chosen[:count], counts[:count]
 
 
-def _unhidden(
+def _unoccluded_light(
     surface: ShadedMesh, rays: Rays, chosen: Int[np.ndarray, "n"], counts: Int[np.ndarray, "n"], lights: Lamps
 ) -> tuple[Float[np.ndarray, "n 3"], Illumination]:
     """Where chosen rays hit, and the light there if nothing hides it."""
@@ -132,19 +132,28 @@ def _unhidden(
     return points, light
 
 
-def _seen_at_places(
-    mesh: Mesh, surface: ShadedMesh, grid: Rays, lights: Lamps, width: int
-) -> tuple[Int[np.ndarray, "r c"], UInt8[np.ndarray, "r c l"]]:
-    """The places where shadows are traced, as indices of rays, and whether each light is lit or hidden there (0 where
-    it does not matter)."""
+class _ShadowGrid(NamedTuple):
+    """The places of an image where shadows are traced, as arrays for the compiled shading."""
+
+    distances: Float[np.ndarray, "n"]
+    """Of the first rays of all pixels."""
+    width: int
+    """Of a row of pixels."""
+    places: Int[np.ndarray, "r c"]
+    """Indices of these rays."""
+    seen: UInt8[np.ndarray, "r c l"]
+    """Whether each light is lit or hidden there; 0 where it does not matter."""
+
+
+def _trace_grid(mesh: Mesh, surface: ShadedMesh, grid: Rays, lights: Lamps, width: int) -> _ShadowGrid:
     rows = np.arange(0, len(grid.faces) // width, STEP)
     places = rows[:, None] * width + np.arange(0, width, STEP)
     chosen = places.ravel()
-    points, light = _unhidden(surface, grid, chosen, np.ones_like(chosen), lights)
+    points, light = _unoccluded_light(surface, grid, chosen, np.ones_like(chosen), lights)
     seen = np.where(light.lit, np.uint8(_LIT), np.uint8(0))
     darken(light.lit, light.lit, mesh.occluded(*segments(points, light.lit, lights.positions)))
     seen[(seen == _LIT) & ~light.lit] = _HIDDEN
-    return places, seen.reshape(*places.shape, -1)
+    return _ShadowGrid(grid.distances, width, places, seen.reshape(*places.shape, -1))
 
 
 @kernel
@@ -228,8 +237,9 @@ def _middle(rays, first, count, surface):
 
 @kernel(fastmath=True)
 @no_type_check
-def _agree(rays, chosen, samples, surface, lights, points, distances, width, places, seen, lit, asked):
+def _adopt_agreement(rays, chosen, samples, surface, lights, points, shadows, lit, asked):
     """Take over what the four places about a pixel agree on: hidden lights are not lit, none of them is asked for."""
+    distances, width, places, seen = shadows
     for i in range(len(chosen)):
         pixel = chosen[i] // samples
         top, left = pixel // width // STEP, pixel % width // STEP

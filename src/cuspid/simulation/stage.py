@@ -83,8 +83,7 @@ def simulate(
     true, known = sample_built(handpiece, options.manufacturing), with_tolerances(handpiece, options.manufacturing)
     _check(true, options)
     path = plan_scan_path(jaw, handpiece, options.path, np.random.default_rng([options.seed, 1]))
-    overlaps = path.min_overlap, path.mean_overlap
-    write_path(folder / "truth" / "path.json", *overlaps, path.seen, path.cross_sweep)
+    write_path(folder / "truth" / "path.json", path.min_overlap, path.mean_overlap, path.seen, path.cross_sweep)
     return take_images(
         jaw,
         true,
@@ -92,7 +91,7 @@ def simulate(
         folder,
         options,
         known=known,
-        less=_less(path),
+        less=_cheaper_settings(path),
         progress=progress,
     )
 
@@ -109,7 +108,7 @@ def take_images(
     progress: Progress = silent,
 ) -> tuple[Capture, GroundTruth]:
     """As :func:`simulate`, from given poses of the handpiece by frame name. The capture has the handpiece ``known``; by
-    default the true one, as exact. ``less``: what takes less time, for those who are told that it takes long."""
+    default the true one, as exact. ``less``: settings that take less time, suggested where it takes long."""
     if options.optics.scattering and not any(APPEARANCES[options.texture].enamel.scattering_mm):
         _LOG.info(f"optics: --scattering changes nothing, for light does not go below the texture {options.texture}")
     handpiece = with_shutters(with_default_lights(handpiece), options.optics)
@@ -119,7 +118,7 @@ def take_images(
     write_truth(folder / "truth", truth)
     capture = Capture(handpiece=known or EXACT.fill(handpiece), frames=frames, source=ImageFolder(folder / "capture"))
     write_capture(folder / "capture", capture)
-    for done, total in _foretold(_render(folder, capture, truth, options), less):
+    for done, total in _log_expected_time(_render(folder, capture, truth, options), less):
         progress("images", done, total)
     # As it will be read: a rotation may differ in its last bit once it was written, and results go by that.
     return replace(capture, handpiece=read_handpiece(folder / "capture" / "handpiece.json")), truth
@@ -163,13 +162,13 @@ class _Sink:
         write_image(self.images.path(frame, camera), image)
 
 
-def _less(path: ScanPath) -> tuple[str, ...]:
+def _cheaper_settings(path: ScanPath) -> tuple[str, ...]:
     share = 1 - path.further_frames / len(path.rig_from_world)
     passes = f"--passes turns takes about {share:.0%} of the images"
     return (passes, _FEWER_PIXELS) if path.further_frames else (_FEWER_PIXELS,)
 
 
-def _foretold(rendered: Iterator[tuple[int, int]], less: Sequence[str]) -> Iterator[tuple[int, int]]:
+def _log_expected_time(rendered: Iterator[tuple[int, int]], less: Sequence[str]) -> Iterator[tuple[int, int]]:
     """What is rendered; after the first images it is logged how many are to come, how long they take here, and, if that
     is long, what takes less."""
     warm = usable_cores()  # the first image of each process is not timed
@@ -196,7 +195,7 @@ _RENDERERS = {"embree": render_capture, "blender": render_with_blender}
 
 
 def look_of(options: RenderOptions) -> dict[str, object]:
-    """Of the options those that the images depend on besides the poses."""
+    """The options, besides the path, that the images depend on."""
     return {each.name: getattr(options, each.name) for each in fields(RenderOptions)}
 
 
@@ -210,7 +209,7 @@ def scene_of(truth: GroundTruth, options: RenderOptions) -> Scene:
     return Scene(
         jaw=truth.jaw,
         handpiece=truth.handpiece,
-        appearance=APPEARANCES[options.texture].seen_by(truth.handpiece.footprint_mm),
+        appearance=APPEARANCES[options.texture].at_footprint(truth.handpiece.footprint_mm),
         supersampling=options.supersampling,
         seed=options.seed,
         optics=options.optics.resolved,

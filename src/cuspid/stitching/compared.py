@@ -39,7 +39,7 @@ class Compared:
     same_lights: bool
     """Whether the two images of a pair were taken at one instant: a place is then as bright in one as in the other."""
 
-    def seen_from(self, world_from_new: Rigid3) -> Compared:
+    def in_world(self, world_from_new: Rigid3) -> Compared:
         """The same in another world."""
         return replace(self, cam_from_world=tuple(pose @ world_from_new for pose in self.cam_from_world))
 
@@ -71,7 +71,7 @@ def cameras_beside(
         for one, other in pairs
         if one in frame.cameras and other in frame.cameras
     ]
-    images = sorted({image for pair in together for image in pair}, key=_in_order(located, found.rig.names))
+    images = sorted({image for pair in together for image in pair}, key=_capture_order(located, found.rig.names))
     place = {image: number for number, image in enumerate(images)}
     apart = [np.linalg.norm(np.diff([found.rig[name].centre_in_rig for name in pair], axis=0)) for pair in pairs]
     return Compared(
@@ -85,7 +85,7 @@ def cameras_beside(
     )
 
 
-def _in_order(frames: Sequence[Frame], cameras: Sequence[str]) -> Callable[[tuple[str, str]], tuple[int, int]]:
+def _capture_order(frames: Sequence[Frame], cameras: Sequence[str]) -> Callable[[tuple[str, str]], tuple[int, int]]:
     """Sorts images, each by the names of its frame and its camera, in order of capture."""
     frame_of = {frame.name: number for number, frame in enumerate(frames)}
     return lambda image: (frame_of[image[0]], cameras.index(image[1]))
@@ -97,7 +97,7 @@ def partners(motion: SparseModel, share: float) -> dict[int, int]:
     poses = [pose.inverse() for pose in motion.cam_from_world.values()]
     centres = np.array([pose.translation for pose in poses])
     axes = np.array([pose.rotation[:, 2] for pose in poses])
-    wanted = share * float(np.median(motion.depths))
+    baseline = share * float(np.median(motion.depths))
     found: dict[int, int] = {}
     for one in range(len(poses) - 1):
         others = np.arange(one + 1, min(one + 1 + _REACH, len(poses)))
@@ -105,7 +105,7 @@ def partners(motion: SparseModel, share: float) -> dict[int, int]:
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         along = np.sum(shift * axis, axis=1)
         sideways = np.linalg.norm(shift - along[:, None] * axis, axis=1)
-        off = np.abs(np.log(np.maximum(sideways, 1e-9) / wanted))
+        off = np.abs(np.log(np.maximum(sideways, 1e-9) / baseline))
         alike = (sideways >= 2 * np.abs(along)) & (axes[others] @ axes[one] > np.cos(np.deg2rad(20)))
         off[~alike] = np.inf
         if off.min() < np.log(1.8):

@@ -1,8 +1,8 @@
 """The occlusal frame and a coarse surface, from what the motion of one camera gives: poses and sparse points.
 
 Frames: the *model* is the frame of the motion, in its own units; the *world* is the occlusal frame of
-:mod:`cuspid.model.panorama`, with z = 0 at the tips of the cusps. Where nothing tells the scale, lengths of the world
-are such that the camera was `NOMINAL_MM` from the teeth, and are not called millimetres.
+:mod:`cuspid.model.panorama`, with z = 0 at the tips of the cusps. Where the scale is unknown, lengths of the world are
+such that the camera was `NOMINAL_MM` from the teeth, and are not called millimetres.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cuspid.model.sparse_model import SparseModel
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.options import Options, Range
 from cuspid.runtime.workers import computed_once
-from cuspid.stitching.trajectory import frames_there
+from cuspid.stitching.trajectory import frames_before_return
 
 NOMINAL_MM = 14.0
 """Distance from an intra-oral camera to the teeth, where nothing else is known."""
@@ -191,14 +191,14 @@ def in_occlusal_frame(model: SparseModel, scale: ScaleOptions | None) -> SparseM
     world_from_model = _upright(points, centres, axes)
     world_from_model = _level_rotation(world_from_model.apply(points)) @ world_from_model
     above = world_from_model.apply(centres)
-    front = _facing_front(above[: frames_there(above[:, :2])], world_from_model.apply(points))
+    front = _turn_to_front(above[: frames_before_return(above[:, :2])], world_from_model.apply(points))
     found = transform_model(near, front @ world_from_model)
     return found.scaled(1 / nearer if scale is None else scale_factor(found, scale))
 
 
 def scale_factor(model: SparseModel, scale: ScaleOptions) -> float:
-    """By what a motion in the occlusal frame is to be scaled: to the known width of the arch, else to the working
-    distance, else to `NOMINAL_MM`."""
+    """Factor that scales a motion in the occlusal frame: to the known width of the arch, else to the working distance,
+    else to `NOMINAL_MM`."""
     if scale.width_mm is not None:
         nearer = NOMINAL_MM / float(np.median(model.depths))
         return nearer * scale.width_mm / _width(nearer * model.tracks.points)
@@ -286,7 +286,7 @@ def _level_rotation(points: Float[np.ndarray, "p 3"]) -> Rigid3:
     return Rigid3(rotation, -rotation @ np.array([0, 0, plane[0]]))
 
 
-def _facing_front(centres: Float[np.ndarray, "f 3"], points: Float[np.ndarray, "p 3"]) -> Rigid3:
+def _turn_to_front(centres: Float[np.ndarray, "f 3"], points: Float[np.ndarray, "p 3"]) -> Rigid3:
     """Turns about Z so that +Y is anterior where the path bends (an arch), else so that the path runs along +X."""
     first, last = centres[0, :2], centres[-1, :2]
     chord = last - first
@@ -319,7 +319,7 @@ def height_map(model: SparseModel, options: HeightMapOptions) -> HeightMap:
     known = near.sum(axis=-1) >= 3
     upper = np.full(known.shape, np.nan)
     upper[known] = np.nanpercentile(heights[known], _UPPER, axis=-1)
-    smooth = _fill_smooth(_bulging(upper), options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
+    smooth = _fill_smooth(_grow_crowns(upper), options.smoothing_mm / options.cell_mm, float(np.median(points[:, 2])))
     heights = smooth.astype(np.float32)
     return HeightMap(corner=low, cell_mm=options.cell_mm, heights=heights, known=np.ones(heights.shape, bool))
 
@@ -343,7 +343,7 @@ def lower_false_rises(dense: HeightMap, sparse: HeightMap, motion: SparseModel) 
     return replace(dense, visible=wide & crown)
 
 
-def _bulging(heights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
+def _grow_crowns(heights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
     """Edges of crowns moved outwards by one cell; unknown cells beside known ones take their height."""
     highest = grey_dilation(np.where(np.isfinite(heights), heights, -np.inf), size=3)
     beside = np.where(np.isfinite(highest), highest, np.nan)

@@ -22,7 +22,7 @@ from cuspid.model.panorama import ZONES, Panorama, Strip
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.options import Options, Range
 from cuspid.runtime.progress import Progress, silent
-from cuspid.stitching.strip import StripOptions, sides_of, zones_of
+from cuspid.stitching.strip import StripOptions, outward_normals, zones_of
 
 _MOST_PX = 30_000_000
 """Pixels of the largest picture."""
@@ -162,7 +162,7 @@ def _columns(curve: Float[np.ndarray, "n 3"], step_mm: float) -> Float[np.ndarra
 def _strip_rays(mesh: Mesh, line: Float[np.ndarray, "w 3"], options: MeshViewOptions) -> Iterator[tuple[str, _Rays]]:
     """The rays of each strip; from one side they reach to where those from the other side start."""
     step, half_mm = options.mm_per_px, options.strip.half_width_mm
-    normals = np.column_stack([sides_of(line[:, :2]), np.zeros(len(line))])
+    normals = np.column_stack([outward_normals(line[:, :2]), np.zeros(len(line))])
     across = np.arange(half_mm, -half_mm, -step)[:, None, None]
     above = np.concatenate([line[:, :2], np.full((len(line), 1), mesh.bounds[1, 2] + 1)], axis=1) + across * normals
     yield "occlusal", _Rays(above, np.broadcast_to([0, 0, -1.0], above.shape))

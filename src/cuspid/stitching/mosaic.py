@@ -1,7 +1,7 @@
 """Frames of one camera, rectified on the surface, to one occlusal view: an orthophoto.
 
-Frames: the world is the occlusal frame of :mod:`cuspid.model.panorama`. The *canvas* is the panorama's pixel grid. A
-frame is only ever held alone; what grows is the canvas.
+Frames: the world is the occlusal frame of :mod:`cuspid.model.panorama`. The *canvas* is the panorama's pixel grid. Only
+one frame is in memory at a time; what grows is the canvas.
 
 First every frame is looked at on a grid of coarse cells, each `CELL_PX` wide: for every cell the best few frames are
 kept, those that look straight down on it, see it away from their border and not burnt out. Then the choice is made
@@ -200,7 +200,7 @@ class _Glance:
 def glance(
     canvas: Canvas, view: PlacedFrame, surface: HeightMap, image: UInt8[np.ndarray, "h w 3"], options: MosaicOptions
 ) -> _Glance:
-    """What a frame is worth in each cell: infinite where it does not see it."""
+    """The weight of a frame in each cell: infinite where it does not see it."""
     world = positions(canvas, view, surface, CELL_PX)
     in_cam = view.cam_from_world.apply(world)
     px = view.camera.project(in_cam).astype(np.float32)
@@ -284,7 +284,7 @@ class _Layers:
         for level, sigma in enumerate([*sigmas, sigmas[-1]]):
             last = level == len(sigmas)
             coarser = np.zeros_like(finer) if last else _masked_blur(finer, valid, sigma)
-            weight = valid * _soft(chosen, sigma)
+            weight = valid * _gaussian(chosen, 2 * sigma)
             layers.bands.append((finer - coarser) * weight[..., None])
             layers.weights.append(weight)
             if not last:
@@ -312,11 +312,6 @@ class _Bands:
         for band, weight in zip(self.sums, self.weights, strict=True):
             total += band / np.maximum(weight, 1e-6)[..., None]
         return total
-
-
-def _soft(mask: Float[np.ndarray, "h w"], sigma: float) -> Float[np.ndarray, "h w"]:
-    """A mask whose edge fades over about 2 sigma."""
-    return np.asarray(_gaussian(mask, 2 * sigma))
 
 
 def _gaussian(array: np.ndarray, sigma: float) -> np.ndarray:

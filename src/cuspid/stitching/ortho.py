@@ -108,8 +108,8 @@ def find_surface_again(
     progress: Progress = silent,
 ) -> Shown:
     """What the same frames show whose poses are known better, with the surface near the one that they showed before,
-    and scaled anew to what sets the scale; arguments as for :func:`find_surface`."""
-    motion = _laid_onto(located, shown.motion, keeps_scale=beside is not None)
+    and rescaled to what sets the scale; arguments as for :func:`find_surface`."""
+    motion = _align_to_model(located, shown.motion, keeps_scale=beside is not None)
     sparse = height_map(motion, options.height_map)
     start = None if shown.dense is None else (shown.dense, _SLACK * _largest_shift(motion, shown.motion))
     dense = _dense(located, motion, sparse, read, beside, options, progress, start)
@@ -158,7 +158,7 @@ def _dense(
     if beside is None:
         compared = frames_beside(motion, options.plane_sweep.baseline_share)
     else:
-        compared = beside.seen_from(into_occlusal_frame(located, motion).inverse())
+        compared = beside.in_world(into_occlusal_frame(located, motion).inverse())
     return plane_sweep(motion, compared, sparse, read, options.plane_sweep, start=start, progress=progress)
 
 
@@ -168,7 +168,7 @@ def into_occlusal_frame(located: SparseModel, motion: SparseModel) -> Rigid3:
     return motion.cam_from_world[first].inverse() @ located.cam_from_world[first]
 
 
-def _laid_onto(model: SparseModel, other: SparseModel, *, keeps_scale: bool) -> SparseModel:
+def _align_to_model(model: SparseModel, other: SparseModel, *, keeps_scale: bool) -> SparseModel:
     """A model in the world of another one of the same frames, to which its cameras lie nearest."""
     seen, there = _tripods(model, float(np.median(model.depths))), _tripods(other, float(np.median(other.depths)))
     scale, rotation, _ = best_similarity(seen, there)
@@ -190,7 +190,7 @@ def _tripods(model: SparseModel, length: float) -> Float[np.ndarray, "k 3"]:
     return np.concatenate([pose.inverse().apply(legs) for pose in model.cam_from_world.values()])
 
 
-_TRUER = "measure between two cusps, and cuspid pano rescale makes it truer"
+_TRUER = "measure between two cusps, and correct it with cuspid pano rescale"
 
 
 def _scale_note(scale: ScaleOptions, *, given: bool) -> str:

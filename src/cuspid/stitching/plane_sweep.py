@@ -8,11 +8,11 @@ that goes along with the camera moves over the surface and pulls what is matched
 instant see the same light and shade: there it is the brightness itself that agrees. The height of each cell then
 follows from semi-global optimisation (Hirschmueller 2008) over the volume of places and heights.
 
-Windows on a plane are wrong where the surface is steep, and its slope tells what light it loses on the way to each
+Windows on a plane are wrong where the surface is steep, and its slope determines the light it loses on the way to each
 camera (see :mod:`cuspid.mvs.glare`). Therefore the same is done again, twice, with finer steps, on copies of the
 surface found before that lie a little higher and lower.
 
-The volume grows with the arch; of the frames only some are held.
+The volume grows with the arch; only some of the frames are in memory.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from skimage.morphology import remove_small_holes, remove_small_objects
 from skimage.restoration import inpaint_biharmonic
 
 from cuspid.geometry import Rigid3
-from cuspid.geometry.gloss import leaving
+from cuspid.geometry.gloss import transmittance
 from cuspid.geometry.semi_global import semi_global
 from cuspid.model.camera import Camera, undistortion_maps
 from cuspid.model.sparse_model import SparseModel
@@ -139,7 +139,7 @@ class Grid(NamedTuple):
 
     @staticmethod
     def of(surface: HeightMap) -> Grid:
-        """That of which a height map was pooled."""
+        """The grid that a height map was pooled from."""
         rows, columns = surface.heights.shape
         cell_mm = surface.cell_mm / _POOL
         return Grid(surface.corner - surface.cell_mm / 2, cell_mm, _POOL * columns, _POOL * rows)
@@ -151,7 +151,7 @@ class Grid(NamedTuple):
 
     @property
     def centres(self) -> Float[np.ndarray, "h w 2"]:
-        """Of the cells."""
+        """Centres of the cells."""
         across, down = (self.cell_mm * (np.arange(count) + 0.5) for count in (self.columns, self.rows))
         return self.corner + np.stack(np.meshgrid(across, down), axis=-1)
 
@@ -236,7 +236,7 @@ class _Projected(NamedTuple):
             high,
             (in_camera @ camera.opencv_matrix.T).astype(np.float32),
             (camera.opencv_matrix @ pose.rotation[:, 2]).astype(np.float32),
-            _made_up_for(facing, exit_index, gamma),
+            _limb_darkening_gain(facing, exit_index, gamma),
         )
 
     def lay(self, image: UInt8[np.ndarray, "h w 3"], higher_mm: float, window: int) -> _Laid:
@@ -253,11 +253,11 @@ _Image = tuple[UInt8[np.ndarray, "h w 3"], _Projected | None]
 
 @kernel(fastmath=True)
 @no_type_check
-def _made_up_for(facing, index, gamma):
+def _limb_darkening_gain(facing, index, gamma):
     """By what grey levels are to be multiplied where a body is seen at an angle of this cosine to its normal."""
     out = np.empty(facing.shape, np.float32)
     for place in np.ndindex(facing.shape):
-        out[place] = leaving(max(facing[place], _OBLIQUE), index) ** (-1 / gamma)
+        out[place] = transmittance(max(facing[place], _OBLIQUE), index) ** (-1 / gamma)
     return out
 
 
@@ -387,7 +387,7 @@ def plane_sweep(
 ) -> HeightMap | None:
     """The surface on which images agree, in the occlusal frame; None where no two of them are compared.
 
-    ``motion`` tells where the teeth are; ``sparse`` is the smooth surface through its points, which tells how high they
+    ``motion`` shows where the teeth are; ``sparse`` is the smooth surface through its points, which shows how high they
     reach; ``read`` gives an image by its name. ``start``: what was found with poses that were a little different, and
     how far from it the surface may lie, mm; it is looked for there alone, and taken as known where it was.
     """
@@ -399,7 +399,7 @@ def plane_sweep(
     grid = Grid.from_motion(motion, max(options.cell_mm, pixel_mm)) if start is None else Grid.of(start[0])
     ceiling = sparse.interpolate(grid.pooled.centres) + _ABOVE_MM
     step_mm = max(options.step_mm, finest_mm)
-    sweep = partial(_swept, compared, _Pictures(compared, read, options.detail_px), ceiling, options)
+    sweep = partial(_sweep_part, compared, _Pictures(compared, read, options.detail_px), ceiling, options)
     finer = [max(step_mm / parts, finest_mm) * np.arange(-copies, copies + 1) for parts, copies in _FINER]
     if start is None:
         levels = np.arange(-options.depth_mm, float(sparse.heights.max()) + _ABOVE_MM + step_mm, step_mm)
@@ -421,7 +421,7 @@ def _part(progress: Progress, number: int, rounds: int) -> Progress:
     return lambda stage, done, total: progress(stage, number * total + done, rounds * total)
 
 
-def _swept(
+def _sweep_part(
     compared: Compared,
     pictures: _Pictures,
     ceiling: Float[np.ndarray, "r c"],

@@ -1,8 +1,8 @@
 """The scale of a finished panorama, from distances that were measured in the mouth between places that it shows.
 
 One camera does not know how large things are. Two cusps can be found both in the mouth and in the picture, so that the
-distance between them, taken with callipers, tells the scale: of all that is to be had without a second camera the
-truest (docs/panorama-evaluation.md).
+distance between them, taken with callipers, sets the scale: of all that is to be had without a second camera the truest
+(docs/panorama-evaluation.md).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Rescaled:
     panorama: Panorama
     """In millimetres."""
     factor: float
-    """By what its lengths grew (millimetres per pixel where they were pixels)."""
+    """Factor by which its lengths grew (millimetres per pixel where they were pixels)."""
     lengths_mm: Float[np.ndarray, "n"]
     """The measured distances, in the panorama as it is now."""
 
@@ -63,7 +63,10 @@ def rescale_panorama(panorama: Panorama, distances: Sequence[MeasuredDistance]) 
         panorama,
         mm_per_px=factor * (panorama.mm_per_px or 1.0),
         height_mm=height,
-        notes=(*_notes(panorama, factor, measured, fitted), *(note for note in panorama.notes if not _on_scale(note))),
+        notes=(
+            *_notes(panorama, factor, measured, fitted),
+            *(note for note in panorama.notes if not note.startswith("the scale ")),
+        ),
     )
     return Rescaled(panorama=new, factor=factor, lengths_mm=fitted)
 
@@ -102,24 +105,19 @@ def _notes(
     panorama: Panorama, factor: float, measured: Float[np.ndarray, "n"], fitted: Float[np.ndarray, "n"]
 ) -> tuple[str, ...]:
     """What the scale is from, how well it can be known, and what does not fit."""
-    told = " and ".join(f"{each:g} mm" for each in measured)
+    lengths = " and ".join(f"{each:g} mm" for each in measured)
     before = "none" if panorama.mm_per_px is None else f"smaller by a factor of {factor:.4f}"
     if panorama.mm_per_px is not None and factor < 1:
         before = f"larger by a factor of {1 / factor:.4f}"
     reading_pct = 100 * _READING_MM / float(np.linalg.norm(fitted))
     known = f"an error of {_READING_MM:g} mm in them is {reading_pct:.2g} % of all lengths"
-    scale = f"the scale is that of {told} between places of the picture (before: {before}); {known}"
+    scale = f"the scale is that of {lengths} between places of the picture (before: {before}); {known}"
     off_pct = 100 * (fitted / measured - 1)
     apart = tuple(
-        f"{mm:g} mm come out as {length:.2f} ({off:+.1f} %): look whether the places and the number are right, or how "
-        "the scale drifts along the arch"
+        f"{mm:g} mm come out as {length:.2f} ({off:+.1f} %): check the places and the number, or whether the scale "
+        f"drifts along the arch"
         for mm, length, off in zip(measured, fitted, off_pct, strict=True)
         if abs(off) > _APART_PCT
     )
     flat = () if panorama.height_mm is not None else ("the panorama has no heights: distances count as level",)
     return (scale, *apart, *flat)
-
-
-def _on_scale(note: str) -> bool:
-    """Whether a note tells what the scale was from."""
-    return note.startswith("the scale ")

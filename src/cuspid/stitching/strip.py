@@ -20,7 +20,7 @@ from cuspid.model.panorama import ZONES, Panorama, Strip
 from cuspid.model.sparse_model import SparseModel
 from cuspid.runtime.options import Options, Range
 from cuspid.stitching.height_map import HeightMap
-from cuspid.stitching.trajectory import STEP_MM, even, forward, frames_there, smooth
+from cuspid.stitching.trajectory import STEP_MM, drop_reversals, frames_before_return, resample_evenly, smooth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,17 +43,19 @@ def arch_curve(motion: SparseModel, surface: HeightMap, options: StripOptions) -
     """World (x, y) of the middle of the crowns, every `STEP_MM`, in the order in which the camera went, until it turned
     back; None where it hardly moved."""
     centres = np.array([pose.inverse().translation[:2] for pose in motion.cam_from_world.values()])
-    curve = even(smooth(even(forward(centres[: frames_there(centres)])), options.smoothing_mm))
+    curve = resample_evenly(
+        smooth(resample_evenly(drop_reversals(centres[: frames_before_return(centres)])), options.smoothing_mm)
+    )
     if STEP_MM * len(curve) < _LEAST_MM:
         return None
     across = np.arange(-options.half_width_mm, options.half_width_mm + STEP_MM, STEP_MM)
     for _ in range(2):
-        normals = sides_of(curve)
+        normals = outward_normals(curve)
         places = curve[:, None] + across[:, None] * normals[:, None]
         heights = surface.interpolate(places)
         weight = np.clip(heights - (heights.max(axis=1, keepdims=True) - options.occlusal_mm), 0, None)
         middle = (weight * across).sum(axis=1) / weight.sum(axis=1)
-        curve = even(smooth(curve + middle[:, None] * normals, options.smoothing_mm))
+        curve = resample_evenly(smooth(curve + middle[:, None] * normals, options.smoothing_mm))
     return _longer(curve, options.half_width_mm)
 
 
@@ -64,7 +66,7 @@ def _longer(curve: Float[np.ndarray, "n 2"], by_mm: float) -> Float[np.ndarray, 
     return np.concatenate([curve[0] + steps[::-1] * head, curve, curve[-1] + steps * tail])
 
 
-def sides_of(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def outward_normals(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Unit normals towards the cheek: away from the inside of the bend."""
     tangents = np.gradient(curve, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
@@ -86,7 +88,9 @@ def unroll(
     columns = int(STEP_MM * (len(curve) - 1) / mm_per_px)
     at = np.linspace(0, len(curve) - 1, columns)
     line = np.stack([np.interp(at, np.arange(len(curve)), curve[:, axis]) for axis in range(2)], axis=1)
-    normals = np.stack([np.interp(at, np.arange(len(curve)), sides_of(curve)[:, axis]) for axis in range(2)], axis=1)
+    normals = np.stack(
+        [np.interp(at, np.arange(len(curve)), outward_normals(curve)[:, axis]) for axis in range(2)], axis=1
+    )
     half = int(options.half_width_mm / mm_per_px)
     across = mm_per_px * np.arange(half, -half - 1, -1)
     places = line + across[:, None, None] * normals

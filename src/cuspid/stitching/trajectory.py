@@ -22,10 +22,10 @@ _ARM_MM, _FOLDED = 8.0, 0.35
 them. Over the front teeth of an arch they are farther apart than 0.8 of it."""
 
 
-def frames_there(centres: Float[np.ndarray, "f 2"]) -> int:
+def frames_before_return(centres: Float[np.ndarray, "f 2"]) -> int:
     """Number of frames until the camera first turns back; all if it never does."""
     lengths = lengths_along(smooth(centres, _TREMOR_FRAMES * STEP_MM))
-    curve = even(forward(centres))
+    curve = resample_evenly(drop_reversals(centres))
     arm = round(_ARM_MM / STEP_MM)
     if len(curve) <= 2 * arm:
         return len(centres)
@@ -40,8 +40,8 @@ def frames_there(centres: Float[np.ndarray, "f 2"]) -> int:
     return max(2, int(np.searchsorted(lengths, share * lengths[-1])))
 
 
-def forward(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
-    """A shaky path without its steps back: the mean of frames, in blocks that each go on by a millimetre."""
+def drop_reversals(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
+    """A shaky path without its steps back: its smoothed places, each at least a millimetre from the last."""
     steady = smooth(path, _TREMOR_FRAMES * STEP_MM)
     kept = [steady[0]]
     for place in steady[1:]:
@@ -52,7 +52,7 @@ def forward(path: Float[np.ndarray, "f 2"]) -> Float[np.ndarray, "n 2"]:
     return np.array(kept)
 
 
-def even(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+def resample_evenly(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """The same curve, sampled every `STEP_MM`."""
     lengths = lengths_along(curve)
     at = np.arange(0, lengths[-1] + STEP_MM / 2, STEP_MM)
@@ -60,7 +60,7 @@ def even(curve: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
 
 
 def smooth(curve: Float[np.ndarray, "n 2"], sigma_mm: float) -> Float[np.ndarray, "n 2"]:
-    """Without short bends; the ends go on straight instead of shrinking."""
+    """A curve without short bends; its ends are extrapolated straight instead of shrinking."""
     pad = min(len(curve) - 1, int(4 * sigma_mm / STEP_MM))
     if pad < 2:
         return curve

@@ -36,21 +36,21 @@ def _board(value: Any) -> Board:
     if not isinstance(value, Mapping):
         raise InputError(f"a board is {quote(value)}; it must be Kalibr's target_type and so on, or options by name")
     if "target_type" not in value:
-        return _of_options(value)
+        return _board_from_options(value)
     kind = value["target_type"]
     if kind not in _KALIBR:
         raise InputError(f"target_type is {quote(kind)}; it must be one of {', '.join(_KALIBR)}")
     return _KALIBR[kind](value)
 
 
-def _of_options(value: Mapping[str, Any]) -> Board:
+def _board_from_options(value: Mapping[str, Any]) -> Board:
     """Raises InputError for names that are none of a board's options."""
     known = {each.name: each.type for each in fields(Board)}
     given = {str(key).replace("-", "_"): each for key, each in value.items()}
     strange = [name for name in given if name not in known]
     if strange or not given:
         raise InputError(
-            f"{', '.join(map(quote, strange)) or 'nothing'} is no option of a board; these are {', '.join(known)}"
+            f"{', '.join(map(quote, strange)) or 'nothing'} is not an option of a board; options are {', '.join(known)}"
         )
     if "square_mm" not in given:
         raise InputError("square_mm is missing: the side of a square in mm")

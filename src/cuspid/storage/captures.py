@@ -42,7 +42,7 @@ def read_capture(
     with its working distance, as :func:`cuspid.storage.handpieces.read_handpiece` takes them.
 
     Without ``capture.json`` the frames are those of the image folders, in the order of their names. A camera that has
-    no image of a frame is left out of that frame, one that has none at all out of the handpiece (``left_out`` tells).
+    no image of a frame is left out of that frame, one that has none at all out of the handpiece (see ``left_out``).
     Raises InputError where a folder belongs to no camera of the handpiece, a frame that ``capture.json`` names has no
     image at all, or an image is truncated or of another size than its camera's.
     """

@@ -109,12 +109,12 @@ class Code:
         tree = _statements(text)
         for body in [*_bodies(tree)]:
             brought: list[tuple[str, str, str]] = []
-            body[:] = [rest for statement in body if (rest := self._without_own(statement, brought)) is not None]
+            body[:] = [rest for statement in body if (rest := self._strip_own_imports(statement, brought)) is not None]
             body.insert(0, ast.Expr(ast.Constant(repr(sorted(brought)))))
         used = sorted(self._brought(PACKAGE, *each) for each in _imports(text) if each[0] == PACKAGE)
         return hashlib.sha256(f"{used} {ast.dump(tree)}".encode()).hexdigest()
 
-    def _without_own(self, statement: ast.stmt, brought: list[tuple[str, str, str]]) -> ast.stmt | None:
+    def _strip_own_imports(self, statement: ast.stmt, brought: list[tuple[str, str, str]]) -> ast.stmt | None:
         """The statement without what it imports from modules of ours, which is added to ``brought``."""
         if not isinstance(statement, ast.Import | ast.ImportFrom):
             return statement

@@ -139,7 +139,8 @@ def _describe(path: Path, error: OSError) -> str:
 def require_suffix(path: Path, *suffixes: str) -> None:
     """Raise OutputError where a file that is to be written has the name of another kind."""
     if path.suffix.lower() not in suffixes:
-        raise OutputError(f"{path}: is no name of what is written; give one that ends in {' or '.join(suffixes)}")
+        choices = " or ".join(suffixes)
+        raise OutputError(f"{path}: has no suffix that can be written; give a name that ends in {choices}")
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -264,7 +265,7 @@ def claim_folder(
 
     ``run.json`` keeps for each stage the version, the settings and the hashes of the inputs. Of files that the settings
     name only the contents count, which are among the inputs. Raises OutputError where the folder holds files that no
-    run of cuspid wrote, or the same stage made from something else; where that may be replaced, since it is made anew
+    run of cuspid wrote, or the same stage made from something else; where that may be replaced, since it is made again
     as a whole, ``run.json`` stays as it is.
     """
     plain = to_plain(settings, path=lambda _: None)
@@ -296,7 +297,7 @@ def claimed_folder(
     results that are to be replaced stay those of the run that made them until the work is done."""
     existed = folder.exists()
     empty = not folder.is_dir() or not any(folder.iterdir())
-    with _alone_in(folder):
+    with _lock_folder(folder):
         try:
             entry = claim_folder(folder, stage, settings, inputs, replace=replace)
             yield
@@ -316,7 +317,7 @@ _holding = threading.Lock()
 
 
 @contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
+def _lock_folder(folder: Path) -> Iterator[None]:
     """No other process works in a folder in the block, which is made if need be. Raises OutputError where one does.
 
     The folder itself is locked (flock), so that no file is left, and the lock of a process that ends ends with it;

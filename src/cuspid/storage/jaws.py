@@ -73,7 +73,7 @@ def read_label_map(path: Path) -> dict[int, int]:
         raise InputError(f"{path}: labels are whole numbers ({one_line(error)})") from error
     for label, fdi in table.items():
         if fdi != GUM and fdi not in FDI_FROM_UNIVERSAL.values():
-            raise InputError(f"{path}: label {label} cannot be {fdi}, which is no FDI number")
+            raise InputError(f"{path}: label {label} cannot be {fdi}, which is not an FDI number")
     return table
 
 

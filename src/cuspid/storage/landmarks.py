@@ -5,9 +5,9 @@ before it is brought into the occlusal frame. Slicer knows patient coordinates, 
 (right, anterior, superior), and reads a mesh file as LPS unless the file says otherwise: LPS is taken for the numbers
 in the mesh file, and RAS has the signs of x and y turned.
 
-Points are told apart by their label alone; the order of a file means nothing. Labels are checked against the scheme of
-names by `cuspid.anatomy.landmarks.scheme.validate`, which knows it. Markups follow Slicer's schema,
-``markups-schema-v1.0.3`` (github.com/Slicer/Slicer, Modules/Loadable/Markups/Resources/Schema).
+Only their labels distinguish points; the order of a file means nothing. Labels are checked against the scheme of names
+by `cuspid.anatomy.landmarks.scheme.validate`, which knows it. Markups follow Slicer's schema, ``markups-schema-v1.0.3``
+(github.com/Slicer/Slicer, Modules/Loadable/Markups/Resources/Schema).
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def read_landmarks(path: Path) -> LandmarkFile:
 def write_landmarks(path: Path, landmarks: Mapping[str, Landmark], frame: LandmarkFrame) -> None:
     """Write landmarks as 3D Slicer markups where the name ends in ``.mrk.json``, else as JSON of cuspid.
 
-    Markups do not tell their frame and are read as ``mesh``: give positions in the frame of the mesh file that they
+    Markups do not state their frame and are read as ``mesh``: give positions in the frame of the mesh file that they
     are to be shown on.
     """
     write_json(path, _markups(landmarks) if path.name.endswith(MARKUPS_SUFFIX) else _own(landmarks, frame))

@@ -64,13 +64,13 @@ def read_mesh_file(path: Path, unit: Unit = "mm") -> MeshFile:
         raise InputError(f"{path}: not a mesh file that cuspid reads; give an STL, PLY, OBJ or OFF file")
     declared = _declared_faces(path)
     try:
-        with np.errstate(all="ignore"), _in_silence():  # what cannot be used is told below
+        with np.errstate(all="ignore"), _silence_trimesh():  # what cannot be used is told below
             scene = trimesh.load_scene(_readable(path), path.suffix[1:].lower(), process=False, skip_materials=True)
             parts = list(scene.geometry.values())
             loaded = parts[0] if len(parts) == 1 else scene.to_mesh()
     except Exception as error:  # trimesh's loaders raise whatever the parser met
         raise InputError(f"{path}: not a mesh ({type(error).__name__}: {one_line(error)}); export it again") from error
-    with _let_go(loaded, *parts):
+    with _free_meshes(loaded, *parts):
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) == 0 or len(loaded.faces) == 0:
             raise InputError(f"{path}: the mesh is empty (no triangles); export the surface, not a point cloud")
         return _check_mesh(path, loaded, declared, unit)
@@ -82,7 +82,7 @@ def _readable(path: Path) -> Path | io.BytesIO:
 
 
 @contextmanager
-def _in_silence() -> Iterator[None]:
+def _silence_trimesh() -> Iterator[None]:
     """trimesh logs what it could not read of a file, with where it was, and goes on."""
     log = logging.getLogger("trimesh")
     before = log.level
@@ -94,7 +94,7 @@ def _in_silence() -> Iterator[None]:
 
 
 @contextmanager
-def _let_go(*meshes: trimesh.parent.Geometry) -> Iterator[None]:
+def _free_meshes(*meshes: trimesh.parent.Geometry) -> Iterator[None]:
     """Free meshes after the block: their parts refer to them and they to their parts, and of millions of faces a
     gigabyte would stay until the garbage is collected."""
     try:
@@ -185,7 +185,7 @@ def write_mesh(
     binary STL, OBJ or OFF, by the file's suffix. CloudCompare shows such values as scalar fields."""
     path = Path(path)
     exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-    with _let_go(exported):
+    with _free_meshes(exported):
         for name, each in values.items():
             exported.vertex_attributes[name] = each.astype(np.float32)
         if face_labels is not None:
@@ -198,7 +198,7 @@ def write_mesh(
 
 
 NO_SCALE = "scale unknown: lengths are not in mm"
-"""Comment of a PLY file of which nothing tells the scale."""
+"""Comment of a PLY file whose scale is unknown."""
 
 
 def has_scale(path: Path) -> bool:

@@ -35,7 +35,7 @@ def is_photographs(source: Path, handpiece: Path | None = None) -> bool:
         return source.suffix.lower() in VIDEO_SUFFIXES
     images = source / "images"
     if not images.is_dir():
-        return bool(images_in(source)) or bool(_not_readable(source))
+        return bool(images_in(source)) or bool(_unreadable_notes(source))
     known = handpiece or source / "handpiece.json"
     if any(path.is_dir() for path in list_finished(images)):
         return known.is_file() and len(read_handpiece(known).rig.names) == 1
@@ -58,7 +58,7 @@ def read_photographs(
     else:
         home = _home(source)
         masks = masks / home.name if home.parent.name == "images" else masks
-        paths, notes = images_in(home), _not_readable(home)
+        paths, notes = images_in(home), _unreadable_notes(home)
     sizes, left_out = _sizes(paths)
     if len(sizes) < 2:
         raise InputError(
@@ -66,7 +66,7 @@ def read_photographs(
             "three that overlap, from different places"
         )
     calibrated = _calibration(source, handpiece)
-    photographs, cameras = _by_camera(sizes, masks, calibrated)
+    photographs, cameras = _group_by_camera(sizes, masks, calibrated)
     for each in photographs:
         each.check_mask()
     unmasked = [each.name for each in photographs if each.mask is None]
@@ -98,7 +98,7 @@ def _home(source: Path) -> Path:
     return inner[0] if inner and not images_in(images) else images
 
 
-def _not_readable(folder: Path) -> list[str]:
+def _unreadable_notes(folder: Path) -> list[str]:
     """A note where there are photographs of a kind that is not read."""
     strange = [path for path in list_finished(folder) if path.suffix.lower() in _UNREADABLE]
     if not strange:
@@ -141,21 +141,21 @@ def _calibration(source: Path, handpiece: Path | None) -> Camera | None:
     return rig[rig.names[0]].camera
 
 
-def _by_camera(
+def _group_by_camera(
     sizes: Mapping[Path, tuple[int, int]], masks: Path, calibrated: Camera | None
 ) -> tuple[tuple[Photograph, ...], dict[str, PhotoCamera]]:
     """Photographs, and the cameras that took them: one for each size and focal length."""
-    told = {path: _Exif.of(path) for path in sizes}
-    stored = {path: told[path].sensor_size(size) for path, size in sizes.items()}
-    kinds = {path: (stored[path], *told[path].lens) for path in sizes}
+    exif = {path: _Exif.of(path) for path in sizes}
+    stored = {path: exif[path].sensor_size(size) for path, size in sizes.items()}
+    kinds = {path: (stored[path], *exif[path].lens) for path in sizes}
     order = list(dict.fromkeys(kinds.values()))
     names = [_ONE] if len(order) == 1 else [f"{_ONE}-{n + 1}" for n in range(len(order))]
     first = {kind: next(path for path in sizes if kinds[path] == kind) for kind in order}
     cameras = {
         name: PhotoCamera(
             size=kind[0],
-            focal_px=told[first[kind]].focal_px(kind[0]),
-            calibrated=None if calibrated is None else _of_size(calibrated, kind[0], first[kind]),
+            focal_px=exif[first[kind]].focal_px(kind[0]),
+            calibrated=None if calibrated is None else _require_size(calibrated, kind[0], first[kind]),
         )
         for name, kind in zip(names, order, strict=True)
     }
@@ -165,7 +165,7 @@ def _by_camera(
             path=path,
             camera=names[order.index(kinds[path])],
             size=stored[path],
-            orientation=told[path].orientation,
+            orientation=exif[path].orientation,
             mask=_mask(masks, path),
         )
         for path in sizes
@@ -173,7 +173,7 @@ def _by_camera(
     return tuple(photographs), cameras
 
 
-def _of_size(camera: Camera, size: tuple[int, int], path: Path) -> Camera:
+def _require_size(camera: Camera, size: tuple[int, int], path: Path) -> Camera:
     """Raises InputError where the photographs are of another size than what was calibrated."""
     if (camera.width, camera.height) == size:
         return camera

@@ -352,8 +352,8 @@ def _rows(folder: Path) -> list[Mapping[str, str]]:
 _STUDY_FIGURES: Mapping[str, str] = {
     "trueness.png": "Trueness and precision: each point is a scan; boxes from the first to the third quartile, "
     "whiskers to the last scan within 1.5 of that range",
-    "modes.png": "Deformation of the arch, a point for each scan: scale, and how far its ends move while the "
-    "middle is held",
+    "modes.png": "Deformation of the arch, a point for each scan: scale, and how far its ends move while the middle "
+    "is fixed",
     "spans.png": "Error against span: each point is a distance of a scan; lines through zero by least squares",
     "agreement.png": "Two scanners on the same distances (Bland and Altman): bias and limits of agreement with their "
     "95 % intervals",
@@ -415,7 +415,7 @@ def _read_panorama(folder: Path, run: Mapping[str, Any]) -> PanoramaResult:
 
 
 def _read_score(folder: Path, run: Mapping[str, Any]) -> ScoreResult:
-    made, true = (_if_there(folder / name) for name in ("made.png", "true.png"))
+    made, true = (_existing(folder / name) for name in ("made.png", "true.png"))
     missing = () if made and true else ("the side-by-side pictures: run cuspid pano evaluate again",)
     return ScoreResult(
         name=folder.resolve().name,
@@ -429,7 +429,7 @@ def _read_score(folder: Path, run: Mapping[str, Any]) -> ScoreResult:
 
 
 def _read_calibration(folder: Path, run: Mapping[str, Any]) -> CalibrationResult:
-    handpiece = _if_there(folder / "handpiece.json")
+    handpiece = _existing(folder / "handpiece.json")
     captions = {
         "residuals.png": "Where each camera saw corners, and their residuals as lines",
         "uncertainty.png": "How well each lens is known: standard deviation of a projection, px",
@@ -464,7 +464,7 @@ def _optional_json(path: Path) -> Any:
     return read_json(path) if path.exists() else None
 
 
-def _if_there(path: Path) -> Path | None:
+def _existing(path: Path) -> Path | None:
     return path if path.exists() else None
 
 

@@ -47,11 +47,11 @@ def read_sequence(
     """
     source = Path(source)
     if source.is_dir():
-        found = _of_capture(source) if (source / "images").is_dir() else _of_folder(source)
+        found = _capture_sequence(source) if (source / "images").is_dir() else _folder_sequence(source)
     elif source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
         if decoded is None:
             raise InputError(f"{source}: a video needs a folder for its frames; name one")
-        found = _of_video(source, Path(decoded), progress)
+        found = _video_sequence(source, Path(decoded), progress)
     elif source.is_file():
         raise InputError(f"{source}: neither a folder of images nor a video ({', '.join(VIDEO_SUFFIXES)})")
     else:
@@ -105,21 +105,21 @@ def name_order(name: str) -> list[tuple[str, int]]:
     return [(text, int(digits or 0)) for text, digits in _NUMBERS.findall(name)]
 
 
-def _of_folder(folder: Path) -> ImageSequence:
+def _folder_sequence(folder: Path) -> ImageSequence:
     paths = images_in(folder)
     orientations = tuple(map(exif_orientation, paths))
     ways = set(orientations)
     if len(ways) < 2:
         return ImageSequence(source=folder, paths=tuple(paths), size=_common_size(folder, paths))
     note = (
-        f"{folder.name}: EXIF says that the camera was held in {len(ways)} ways; its images are taken as "
-        "the sensor recorded them, none is turned upright"
+        f"{folder.name}: EXIF says that the camera was held in {len(ways)} orientations; its images are used as the "
+        f"sensor recorded them, not turned upright"
     )
     size = _common_size(folder, paths, as_recorded=True)
     return ImageSequence(source=folder, paths=tuple(paths), size=size, notes=(note,), orientations=orientations)
 
 
-def _of_capture(folder: Path) -> ImageSequence:
+def _capture_sequence(folder: Path) -> ImageSequence:
     capture = read_capture(folder)
     names = capture.handpiece.rig.names
     if len(names) > 1:
@@ -154,7 +154,7 @@ def _common_size(folder: Path, paths: list[Path], *, as_recorded: bool = False) 
     return usual
 
 
-def _of_video(video: Path, decoded: Path, progress: Progress) -> ImageSequence:
+def _video_sequence(video: Path, decoded: Path, progress: Progress) -> ImageSequence:
     length = video_length(video)
     step = max(1, -(-length.frames // MOST_FRAMES))
     paths, number, time_s = [], 0, None

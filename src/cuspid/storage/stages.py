@@ -25,7 +25,7 @@ from cuspid.storage.code_digest import PACKAGE, Code
 from cuspid.storage.files import digest_of, hash_file, open_to_append
 
 RECORD = "made.jsonl"
-"""Name of the file that tells what a folder's results were made from."""
+"""Name of the file that records what a folder's results were made from."""
 
 _log = logging.getLogger("cuspid")
 
@@ -90,7 +90,7 @@ class Stage:
         if not self.has(key, files):
             stale = [file for file in files if file.exists() and self._name(file) in self._made]
             if stale:
-                _log.info(f"{stale[0]}: {self._why(stale[0], key)}; making it again")
+                _log.info(f"{stale[0]}: {self._rerun_reason(stale[0], key)}; making it again")
             write()
             self.record(key, files)
         return key
@@ -110,7 +110,7 @@ class Stage:
     def _name(self, file: Path) -> str:
         return os.path.relpath(file, self.folder)
 
-    def _why(self, file: Path, key: str) -> str:
+    def _rerun_reason(self, file: Path, key: str) -> str:
         made_under, contents = self._made[self._name(file)]
         return (
             "made from other inputs, options or code" if made_under != key or contents == _digest(file) else "damaged"

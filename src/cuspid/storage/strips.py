@@ -1,4 +1,4 @@
-"""Strips of another scale: the picture stays, what is told in millimetres grows."""
+"""Strips of another scale: the picture stays, its lengths in millimetres are scaled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Length units of mesh files, which no mesh file states: sizes tell them, most of all where two files meet."""
+"""Length units of mesh files, which no mesh file states: sizes reveal them, most of all where two files meet."""
 
 from __future__ import annotations
 
@@ -70,22 +70,22 @@ def require_size(file: MeasuredFile) -> None:
     """Raise InputError where a surface is too small or too large to have been scanned, naming the unit that it seems to
     be in."""
     if not _SURFACE_MM[0] <= file.width_mm <= _FARTHEST_MM:
-        raise InputError(f"{_unit_in_file(file)}, which is no size of teeth or jaws; {_advice(file, _USUAL_MM)}")
+        raise InputError(f"{_describe_unit(file)}, which is not the size of teeth or jaws; {_advice(file, _USUAL_MM)}")
 
 
 def require_one_unit(scan: MeasuredFile, reference: MeasuredFile) -> None:
-    """Raise InputError where the sizes of two surfaces that are to be compared tell that one of them, or both, is in
-    another unit, naming which and what unit that seems to be."""
-    wrong = _of_another_unit(scan, reference)
+    """Raise InputError where the sizes of two surfaces to be compared show that one or both are in another unit; it
+    names which, and the likely unit."""
+    wrong = _in_another_unit(scan, reference)
     if wrong is None:
         return
     other = reference if wrong is scan else scan
     sound = _SURFACE_MM[0] <= other.width_mm <= _SURFACE_MM[1]
-    told = f"{_unit_in_file(wrong)}, {other.path} {other.width_mm:.3g} mm ({other.option} {other.unit})"
-    raise InputError(f"{told}: they cannot be of one size; {_advice(wrong, other.width_mm if sound else _USUAL_MM)}")
+    sizes = f"{_describe_unit(wrong)}, {other.path} {other.width_mm:.3g} mm ({other.option} {other.unit})"
+    raise InputError(f"{sizes}: their sizes do not match; {_advice(wrong, other.width_mm if sound else _USUAL_MM)}")
 
 
-def _of_another_unit(scan: MeasuredFile, reference: MeasuredFile) -> MeasuredFile | None:
+def _in_another_unit(scan: MeasuredFile, reference: MeasuredFile) -> MeasuredFile | None:
     """The one of two surfaces, the less likely one, that is in another unit; None where they may be in one."""
     ratios = scan.extents_mm / np.maximum(reference.extents_mm, 1e-300)
     least_usual = max(scan, reference, key=lambda file: abs(np.log(max(file.width_mm, 1e-300) / _USUAL_MM)))
@@ -101,7 +101,7 @@ def _ratios_of_units() -> Iterable[float]:
     return (one / other for one in MM_PER_UNIT.values() for other in MM_PER_UNIT.values() if one != other)
 
 
-def _unit_in_file(file: MeasuredFile) -> str:
+def _describe_unit(file: MeasuredFile) -> str:
     return f"{file.path}: the mesh is {file.width_mm:.3g} mm wide ({file.option} {file.unit})"
 
 

@@ -130,7 +130,7 @@ def convergence_deg(baseline_mm: float, distance_mm: float) -> float:
     return float(np.rad2deg(2 * np.arctan(baseline_mm / (2 * distance_mm))))
 
 
-def facing(
+def pose_facing(
     mesh: Mesh, surface: Bool[np.ndarray, "f"], baseline_along: Float[np.ndarray, "3"], distance_mm: float
 ) -> Rigid3:
     """``pair_from_world`` of a pair that looks squarely at the middle of a surface, along its mean normal."""
@@ -170,7 +170,7 @@ def study_camera_pair(
     over what is seen of the bound with constant noise, ``noise_growth`` is the RMS factor by which matching there is
     noisier; ``expected_*_um`` are those of the bound with that noise, over what is matched; ``within_budget_pct`` is
     the share of the whole surface that is matched and expected within the budget. None where nothing is seen or
-    matched; ``in_tissue`` tells that a camera would touch the jaw, and then nothing is seen.
+    matched; ``in_tissue`` says that a camera would touch the jaw, and then nothing is seen.
 
     Raises InputError where the jaw lacks the tooth, or the tooth a surface to face.
     """
@@ -219,14 +219,14 @@ def _evaluate(
 ) -> list[Row]:
     """The rows of one pair."""
     law = MATCHING[options.matcher]
-    pose = facing(mesh, tooth.surfaces[faced], tooth.baseline_along[faced], distance_mm)
+    pose = pose_facing(mesh, tooth.surfaces[faced], tooth.baseline_along[faced], distance_mm)
     cameras = tuple(camera_pair(baseline_mm, axis_angle_deg, PRESETS[options.sensor].camera).cameras.values())
     in_tissue = _touches(mesh, pose, cameras)
     faces = tooth.faces[:0] if in_tissue else _seen_by_all(mesh, pose, cameras, options.visibility, tooth.faces)
     constant = NoiseModel(sigma_px=law.noise.sigma_px)
     target = np.array([[0.0, 0.0, distance_mm]])
     common: Row = {
-        "facing": faced,
+        "pose_facing": faced,
         "baseline_mm": baseline_mm,
         "axis_angle_deg": axis_angle_deg,
         "distance_mm": distance_mm,
@@ -341,8 +341,8 @@ def best_pairs(
     sign = 1 if term.endswith("_pct") else -1
     groups: dict[tuple[object, ...], list[Row]] = {}
     for row in rows:
-        if row["surface"] == row["facing"] and row[term] is not None:
-            groups.setdefault((row["facing"], *(row[name] for name in by)), []).append(row)
+        if row["surface"] == row["pose_facing"] and row[term] is not None:
+            groups.setdefault((row["pose_facing"], *(row[name] for name in by)), []).append(row)
     return [max(group, key=lambda row: sign * float(row[term] or 0.0)) for group in groups.values()]
 
 
@@ -353,7 +353,7 @@ def table(
     chosen = [
         row
         for row in rows
-        if row["surface"] == row["facing"] == faced and all(row[name] == value for name, value in fixed.items())
+        if row["surface"] == row["pose_facing"] == faced and all(row[name] == value for name, value in fixed.items())
     ]
     places = np.array([[float(row[name] or 0.0) for name in axes] for row in chosen]).reshape(-1, 2)
     first, at_first = np.unique(places[:, 0], return_inverse=True)

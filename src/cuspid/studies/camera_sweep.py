@@ -46,7 +46,7 @@ from cuspid.simulation.appearance import Preset
 from cuspid.simulation.path.detour import repair_path
 from cuspid.simulation.path.overlap import image_overlap
 from cuspid.simulation.path.scan import ScanPathOptions, plan_scan_path, steady_poses
-from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, facing
+from cuspid.studies.camera_pair import Direction, baseline_axis, camera_pair, pose_facing
 from cuspid.studies.grid import Case, Outcome, Value, run_grid
 from cuspid.studies.trial import Trial, TrialOptions, run_trial
 
@@ -174,13 +174,13 @@ def find_site(jaw: Jaw, options: SweepOptions) -> Site:
     """
     mask = surface_faces(jaw, options.chosen_tooth, options.surface)
     axis = baseline_axis(jaw, options.chosen_tooth, options.surface, options.chosen_direction)
-    pair_from_world = facing(jaw.mesh, mask, axis, options.distance_mm)
+    pair_from_world = pose_facing(jaw.mesh, mask, axis, options.distance_mm)
     middle = steady_poses(jaw, options.path, per_pass=3)[1]
     pair_from_rig = pair_from_world @ middle.inverse()
     narrowest = pair_handpiece(pair_from_rig, (min(options.baseline_mm), options.angle_deg[0]), options)
     steady = steady_poses(jaw, options.path, per_pass=options.path.frames or 10)
     room = Room(jaw.mesh, narrowest.solid, options.path.clearance_mm)
-    held_clear(room, {f"{index:05d}": pose for index, pose in enumerate(steady)}, pair_from_rig, options)
+    clear_path(room, {f"{index:05d}": pose for index, pose in enumerate(steady)}, pair_from_rig, options)
     paths = {
         seed: plan_scan_path(jaw, narrowest, options.path, np.random.default_rng([seed, 1])).rig_from_world
         for seed in range(options.repeats + 1)
@@ -220,7 +220,7 @@ def _outside_of(jaw: Jaw, tooth: int, faces: Bool[np.ndarray, "f"]) -> Bool[np.n
     return within & (out > middle) & (out < out[faces].max() + _NEIGHBOURHOOD_MM)
 
 
-def held_clear(
+def clear_path(
     room: Room, rig_from_world: Mapping[str, Rigid3], pair_from_rig: Rigid3, options: SweepOptions
 ) -> dict[str, Rigid3]:
     """The path of the pair, its frames changed by as little as it needs to keep clear of the jaw, as those of any scan.
@@ -288,7 +288,7 @@ def sweep_case(
     begin = time.process_time()
     handpiece = pair_handpiece(site.pair_from_rig, (baseline_mm, angle_deg), options)
     room = Room(site.jaw.mesh, handpiece.solid, options.path.clearance_mm)
-    poses = held_clear(room, site.rig_from_world[seed], site.pair_from_rig, options)
+    poses = clear_path(room, site.rig_from_world[seed], site.pair_from_rig, options)
     overlap = image_overlap(site.jaw.mesh, handpiece, list(poses.values()))
     how = TrialOptions(
         simulation=SimulationOptions(texture=options.texture, supersampling=options.supersampling, seed=seed),

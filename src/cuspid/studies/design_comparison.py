@@ -169,7 +169,7 @@ def _prepared_jaw(edge_mm: float) -> Jaw:
     return prepare(_phantom(edge_mm), preset("thesis-reference"))
 
 
-def _boxed_mean(edge_mm: float) -> Jaw:
+def _boxed_mean_jaw(edge_mm: float) -> Jaw:
     """Boxes over the mean jaw, whose flat sides do not depend on the length of the edges."""
     drawn = draw_population(
         "lower-14", _MEAN_COUNT, np.random.default_rng(0), PhantomOptions(edge_mm=max(edge_mm, _MEAN_EDGE_MM))
@@ -178,7 +178,7 @@ def _boxed_mean(edge_mm: float) -> Jaw:
 
 
 _JAWS: Mapping[str, Callable[[float], Jaw]] = MappingProxyType(
-    {"phantom": _phantom, "thesis-reference": _prepared_jaw, "boxed-mean": _boxed_mean}
+    {"phantom": _phantom, "thesis-reference": _prepared_jaw, "boxed-mean": _boxed_mean_jaw}
 )
 
 

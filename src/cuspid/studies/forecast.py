@@ -11,7 +11,7 @@ from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.surfaces import named_surfaces
 from cuspid.handpiece.brief import DesignBrief
 from cuspid.handpiece.optimise import Design, SearchOptions, Section, optimise_handpiece
-from cuspid.handpiece.precision import NoiseModel, PrecisionMap, at_best, precision_map
+from cuspid.handpiece.precision import NoiseModel, PrecisionMap, best_of_positions, precision_map
 from cuspid.model.jaw import Jaw
 from cuspid.model.rig import Handpiece
 from cuspid.model.visibility import Visibility, VisibilityOptions, survey_visibility
@@ -73,4 +73,4 @@ def bound_over(
 ) -> PrecisionMap:
     """How precisely each face could be measured from the best of five places on each pass of a steady hand."""
     poses = steady_poses(jaw, path, per_pass=5)
-    return at_best([precision_map(jaw.mesh, handpiece, pose, noise, visibility=visibility) for pose in poses])
+    return best_of_positions([precision_map(jaw.mesh, handpiece, pose, noise, visibility=visibility) for pose in poses])

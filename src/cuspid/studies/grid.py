@@ -103,7 +103,11 @@ def run_grid(
     left = [case for case in cases if case.name not in done]
     progress(stage, len(done), len(cases))
     if left:
-        outcomes = _on_cluster(left, work, cluster) if cluster else _in_processes(left, work, workers or usable_cores())
+        outcomes = (
+            _run_on_cluster(left, work, cluster)
+            if cluster
+            else _run_in_processes(left, work, workers or usable_cores())
+        )
         for outcome in outcomes:
             done[outcome.case.name] = outcome
             _write(folder, outcome)
@@ -158,11 +162,7 @@ def _attempt(work: Work, case: Case) -> Outcome:
     except CuspidError as error:
         return Outcome(case=case, figures={}, failure=str(error))
     except Exception as error:  # one broken case must not end a study of many hours
-        return Outcome(case=case, figures={}, failure=_one_line(error))
-
-
-def _one_line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}".splitlines()[0]
+        return Outcome(case=case, figures={}, failure=f"{type(error).__name__}: {error}".splitlines()[0])
 
 
 # --- Local processes -----------------------------------------------------------------------------------------------
@@ -178,7 +178,7 @@ class _Running:
     core: int
 
 
-def _in_processes(cases: Sequence[Case], work: Work, workers: int) -> Iterator[Outcome]:
+def _run_in_processes(cases: Sequence[Case], work: Work, workers: int) -> Iterator[Outcome]:
     """Outcomes as they come, from at most so many processes at once."""
     waiting = list(reversed(cases))
     cores = core_numbers()
@@ -241,7 +241,7 @@ def _collect(finished: _Running) -> Outcome:
 # --- Dask ----------------------------------------------------------------------------------------------------------
 
 
-def _on_cluster(cases: Sequence[Case], work: Work, address: str) -> Iterator[Outcome]:
+def _run_on_cluster(cases: Sequence[Case], work: Work, address: str) -> Iterator[Outcome]:
     """Outcomes as they come from the workers of a Dask scheduler."""
     try:
         import distributed

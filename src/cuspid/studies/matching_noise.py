@@ -37,7 +37,7 @@ from cuspid.studies.camera_pair import (
     baseline_axis,
     camera_pair,
     convergence_deg,
-    facing,
+    pose_facing,
     tooth_surfaces,
 )
 
@@ -122,7 +122,7 @@ def _sample_pair(
     handpiece = _handpiece(options, baseline_mm)
     surface = tooth_surfaces(jaw, options.tooth)["occlusal"]
     along = baseline_axis(jaw, options.tooth, "occlusal", "across")
-    pose = facing(jaw.mesh, surface, along, options.distance_mm)
+    pose = pose_facing(jaw.mesh, surface, along, options.distance_mm)
     images = _images(jaw, handpiece, pose, options)
     cameras = tuple(handpiece.rig.cameras.values())
     points = _true_points(jaw, cameras, pose, options)
@@ -165,7 +165,7 @@ def _handpiece(options: MatchingNoiseOptions, baseline_mm: float) -> Handpiece:
 def _images(
     jaw: Jaw, handpiece: Handpiece, pose: Rigid3, options: MatchingNoiseOptions
 ) -> tuple[UInt8[np.ndarray, "h w"], ...]:
-    appearance = APPEARANCES[options.texture].seen_by(handpiece.footprint_mm)
+    appearance = APPEARANCES[options.texture].at_footprint(handpiece.footprint_mm)
     scene = Scene(jaw=jaw, handpiece=handpiece, appearance=appearance, seed=options.seed)
     gain = auto_gain(scene, [pose])
     frame = Frame(name=handpiece.name, cameras=handpiece.rig.names)

@@ -143,7 +143,7 @@ def _render(
     jaw: Jaw, handpiece: Handpiece, poses: Mapping[str, Rigid3], texture: Preset
 ) -> list[UInt8[np.ndarray, "h w 3"]]:
     """Every camera at every pose, poses first."""
-    appearance = APPEARANCES[texture].seen_by(handpiece.footprint_mm)
+    appearance = APPEARANCES[texture].at_footprint(handpiece.footprint_mm)
     scene = Scene(jaw=jaw, handpiece=handpiece, appearance=appearance, supersampling=1, seed=0)
     frames, poses = lit_frames(handpiece, poses)
     gains = metered_gains(scene, frames, poses)

@@ -238,7 +238,7 @@ def stitch_as_thesis(
     parts = sorted((chain for chain in chains if len(chain.placed) > 1), key=lambda chain: -len(chain.placed))
     reasons = {index: reason for chain in chains for index, reason in chain.refused.items()}
     if not parts:
-        raise ReconstructionError(_nothing(sequence, reasons))
+        raise ReconstructionError(_describe_failure(sequence, reasons))
     notes = (*sequence.notes, *notes, *_break_notes(sequence, parts), _PLANE_NOTE)
     panoramas = []
     for number, chain in enumerate(parts, start=1):
@@ -314,7 +314,7 @@ def _break_notes(sequence: ImageSequence, parts: list[Chain]) -> tuple[str, ...]
     return tuple(notes)
 
 
-def _nothing(sequence: ImageSequence, reasons: Mapping[int, str]) -> str:
+def _describe_failure(sequence: ImageSequence, reasons: Mapping[int, str]) -> str:
     common, count = Counter(reason.split(":")[0] for reason in reasons.values()).most_common(1)[0]
     return (
         f"{sequence.source}: no two of {len(sequence)} frames could be connected ({count} failed on {common}); "

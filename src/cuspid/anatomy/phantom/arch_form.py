@@ -60,7 +60,7 @@ class Aim:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Seen:
-    """What the plane does not tell: taken from the teeth as they stood before."""
+    """What the plane leaves open: taken from the teeth as they stood before."""
 
     heights: Mapping[tuple[int, int], float] = field(default_factory=dict)
     """Z of the landmark of each tooth by side and position, mm."""

@@ -110,12 +110,12 @@ def place_teeth(
     teeth: tuple[PlacedTooth, ...] = ()
     for turn in range(_rounds(options) + 1):
         if turn:
-            closing = _closed_up(teeth, closing)
+            closing = _closing_shifts_mm(teeth, closing)
             seen = _measure_landmarks(teeth, aim, papilla_of)
         if turn == CONTACT_ROUNDS:
             loose = closing
         if turn >= CONTACT_ROUNDS and turn % 2 == 0 and options.crowding_mm:
-            crowd = _more_crowded(crowd, _closed_gaps_mm(closing, loose), options.crowding_mm)
+            crowd = _next_displacement_mm(crowd, _closed_gaps_mm(closing, loose), options.crowding_mm)
         stood = _crowd_front(rows, crowd, options)
         sized = _resize_teeth(stood, shape.size)
         shape = solve_shape(_chains(sized, closing, options.arch), shape.size, aim, seen, shape)
@@ -219,7 +219,7 @@ def _chains(rows: Rows, closing: dict[int, Float[np.ndarray, "_"]], arch: Arch) 
             natural=_natural_headings(positions, arch),
             widths=np.array([tooth.crown.width_mm for _, tooth in rows[side]]),
             closing=closing[side],
-            points=np.array([_from_contacts(position, tooth) for position, tooth in rows[side]]),
+            points=np.array([_landmark_from_contacts(position, tooth) for position, tooth in rows[side]]),
         )
 
     return chain(-1), chain(1)
@@ -233,7 +233,7 @@ def _natural_headings(positions: tuple[int, ...], arch: Arch) -> Float[np.ndarra
     return np.interp(np.cumsum(kept) - kept / 2, along, natural)
 
 
-def _from_contacts(position: int, tooth: Tooth) -> Point:
+def _landmark_from_contacts(position: int, tooth: Tooth) -> Point:
     """The landmark that the arch is measured at, or else the middle of the tooth, from the line of contacts."""
     if position not in DIMENSION_POINTS:
         return np.array([0.0, tooth.offset_mm, 0.0])
@@ -323,7 +323,7 @@ def _check(teeth: tuple[PlacedTooth, ...], shape: Shape, aim: Aim, papilla_of: P
 # Contacts
 
 
-def _closed_up(
+def _closing_shifts_mm(
     teeth: tuple[PlacedTooth, ...], closing: dict[int, Float[np.ndarray, "_"]]
 ) -> dict[int, Float[np.ndarray, "_"]]:
     """How far each tooth is to be drawn towards its mesial neighbour so that they touch, mm."""
@@ -375,7 +375,7 @@ def _closed_gaps_mm(closing: dict[int, Float[np.ndarray, "_"]], loose: dict[int,
     return float(sum((closing[side] - loose[side])[:3].sum() for side in (-1, 1)))
 
 
-def _more_crowded(lingual_mm: float, got_mm: float, asked_mm: float) -> float:
+def _next_displacement_mm(lingual_mm: float, got_mm: float, asked_mm: float) -> float:
     """The next displacement: the shortening goes about with its square."""
     if not lingual_mm:
         return float(np.sqrt(asked_mm))

@@ -15,9 +15,9 @@ from cuspid.anatomy.phantom.isosurface import (
     evaluate,
     mesh_of,
     newton_step,
-    onto_surface,
+    prevent_folds,
+    project_to_surface,
     value_and_gradient,
-    without_folds,
 )
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.anatomy.phantom.solid import Solid
@@ -37,9 +37,9 @@ def build_phantom(options: PhantomOptions = PhantomOptions()) -> Jaw:
     solid = _solid(options)
     landmarks = landmarks_of(solid, options.arch)
     vertices, faces = mesh_of(solid.distance, *solid.bounds, options.edge_mm)
-    vertices = _onto_margin(solid, vertices, faces, options.edge_mm)
-    labels = _one_patch_each(faces, solid.labels(vertices[faces].mean(axis=1)))
-    vertices = _through(vertices, faces, np.array([landmark.position for landmark in landmarks.values()]))
+    vertices = _snap_to_margin(solid, vertices, faces, options.edge_mm)
+    labels = _connect_labels(faces, solid.labels(vertices[faces].mean(axis=1)))
+    vertices = _snap_to_points(vertices, faces, np.array([landmark.position for landmark in landmarks.values()]))
     return Jaw(mesh=Mesh(vertices, faces), face_labels=labels, arch=options.arch, landmarks=landmarks)
 
 
@@ -69,7 +69,7 @@ def _solid(options: PhantomOptions) -> Solid:
     return add_gum(place_teeth(options, individuals, lambda teeth: papilla(add_gum(teeth), options.arch)))
 
 
-def _through(
+def _snap_to_points(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Points
 ) -> Float[np.ndarray, "v 3"]:
     """The vertices, of which those next to the points are moved to them: the surface has sharp grooves and corners,
@@ -79,14 +79,14 @@ def _through(
         left = (vertices[near] != points[:, None]).any(axis=2).all(axis=1)
         moved = vertices.copy()
         moved[candidates[left]] = points[left]
-        vertices = without_folds(vertices, moved, faces)
+        vertices = prevent_folds(vertices, moved, faces)
     return vertices
 
 
 # The labels
 
 
-def _onto_margin(
+def _snap_to_margin(
     solid: Solid, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], edge_mm: float
 ) -> Float[np.ndarray, "v 3"]:
     """Vertices beside the margin of the gum moved onto it, so that edges run along it."""
@@ -96,20 +96,20 @@ def _onto_margin(
     nearer = np.abs(lead[ends[:, 0]]) < np.abs(lead[ends[:, 1]])
     beside = np.unique(np.where(nearer, ends[:, 0], ends[:, 1]))
     moved = vertices.copy()
-    moved[beside] = _along_surface(solid, vertices[beside], 0.4 * edge_mm)
-    return without_folds(vertices, moved, faces)
+    moved[beside] = _slide_to_margin(solid, vertices[beside], 0.4 * edge_mm)
+    return prevent_folds(vertices, moved, faces)
 
 
-def _along_surface(solid: Solid, points: Points, limit_mm: float) -> Points:
+def _slide_to_margin(solid: Solid, points: Points, limit_mm: float) -> Points:
     """Points (n, 3) of the surface moved within it towards the margin of the gum."""
     values, slope = value_and_gradient(solid.lead_of_gum, points)
     _, normal = value_and_gradient(solid.distance, points)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
     tangential = slope - (slope * normal).sum(axis=1, keepdims=True) * normal
-    return onto_surface(solid.distance, newton_step(points, values, tangential, limit_mm), limit_mm)
+    return project_to_surface(solid.distance, newton_step(points, values, tangential, limit_mm), limit_mm)
 
 
-def _one_patch_each(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
+def _connect_labels(faces: Int[np.ndarray, "f 3"], labels: Int[np.ndarray, "f"]) -> Int[np.ndarray, "f"]:
     """Labels (f,) of which each is one connected patch: specks take the label that surrounds them."""
     pairs = neighbours_of(faces)
     for _ in range(3):

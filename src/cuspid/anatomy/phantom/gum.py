@@ -37,7 +37,7 @@ class Gum:
     def from_teeth(teeth: tuple[PlacedTooth, ...], waves: Float[np.ndarray, "w 4"]) -> "Gum":
         """The ridge that holds the teeth, uneven by the given waves."""
         cervices = np.array([placed.origin for placed in teeth])
-        first, last = (_beyond(cervices[k], cervices[j]) for k, j in ((0, 1), (-1, -2)))
+        first, last = (_extrapolate(cervices[k], cervices[j]) for k, j in ((0, 1), (-1, -2)))
         knots = np.vstack([first, cervices, last])
         widths = np.array([placed.tooth.crown.half_depth_mm for placed in teeth])
         table = np.column_stack([knots, np.pad(widths, 1, mode="edge")])
@@ -81,7 +81,7 @@ class Gum:
         return 0.25 / np.sqrt(WAVES) * waves.sum(axis=1)
 
 
-def _beyond(end: Float[np.ndarray, "3"], before: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def _extrapolate(end: Float[np.ndarray, "3"], before: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """A point (3,) behind the last molar, along the line from the tooth before it."""
     step = end - before
     return end + 0.5 * step * [1.0, 1.0, 0.0]

@@ -29,11 +29,11 @@ def mesh_of(
     field: Field, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], edge_mm: float
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """The zero surface of a field as one closed mesh with well-shaped faces; it is cut off where it leaves the box."""
-    volume = _with_border_outside(_sample_band(field, low, high, edge_mm), edge_mm)
+    volume = _clear_border(_sample_band(field, low, high, edge_mm), edge_mm)
     vertices, faces, _, _ = marching_cubes(volume, 0.0, gradient_direction="descent")
     vertices, faces = _largest_part(low + edge_mm * vertices.astype(float), faces.astype(np.int64))
     for _ in range(2):
-        vertices = onto_surface(field, _relax(vertices, faces), edge_mm)
+        vertices = project_to_surface(field, _relax(vertices, faces), edge_mm)
     return vertices, faces
 
 
@@ -46,14 +46,14 @@ def _sample_band(field: Field, low: Float[np.ndarray, "3"], high: Float[np.ndarr
     while size:
         values = evaluate(field, low + (cells * size + (size - 1) / 2) * edge_mm)
         x, y, z = np.moveaxis(size * cells[:, None] + _inner(size), -1, 0)
-        volume[x, y, z] = _off_zero(values, 0.02 * edge_mm)[:, None]
+        volume[x, y, z] = _avoid_zero(values, 0.02 * edge_mm)[:, None]
         near = np.abs(values) < 1.25 * size * edge_mm
         size //= 2
         cells = (2 * cells[near, None] + _inner(2)).reshape(-1, 3)
     return volume
 
 
-def _with_border_outside(volume: np.ndarray, distance: float) -> np.ndarray:
+def _clear_border(volume: np.ndarray, distance: float) -> np.ndarray:
     """The volume with nothing of the inside on its border, where the surface would be open."""
     border = np.pad(np.zeros(np.subtract(volume.shape, 2), dtype=bool), 1, constant_values=True)
     return np.where(border & (volume < 0), np.float32(distance), volume)
@@ -70,7 +70,7 @@ def evaluate(field: Field, points: Points) -> Values:
     return np.concatenate([field(part) for part in parts])
 
 
-def _off_zero(values: Values, least: float) -> Values:
+def _avoid_zero(values: Values, least: float) -> Values:
     """Values (n,) kept away from zero, so that no vertex coincides with a grid point."""
     return np.where(values < 0, np.minimum(values, -least), np.maximum(values, least))
 
@@ -92,7 +92,7 @@ def _relax(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) ->
     return 0.5 * vertices + 0.5 * (adjacency @ vertices) / degree[:, None]
 
 
-def onto_surface(field: Field, vertices: Float[np.ndarray, "v 3"], edge_mm: float) -> Float[np.ndarray, "v 3"]:
+def project_to_surface(field: Field, vertices: Float[np.ndarray, "v 3"], edge_mm: float) -> Float[np.ndarray, "v 3"]:
     """Vertices moved along the gradient onto the zero surface, by at most half an edge."""
     values, gradient = value_and_gradient(field, vertices)
     return newton_step(vertices, values, gradient, 0.5 * edge_mm)
@@ -112,7 +112,7 @@ def newton_step(points: Points, values: Values, gradient: Points, limit_mm: floa
     return points + move * np.minimum(1.0, limit_mm / np.maximum(length, 1e-12))
 
 
-def without_folds(
+def prevent_folds(
     vertices: Float[np.ndarray, "v 3"], moved: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v 3"]:
     """The moved vertices, but for those that would turn one of their faces over or flatten it."""

@@ -152,7 +152,7 @@ def _ball(options: SphereArchOptions) -> Manifold:
 def _ridge(options: SphereArchOptions, centres: Float[np.ndarray, "n 3"]) -> Manifold:
     """A ridge with a flat underside along the spheres, its top `rise_mm` below their centres."""
     half = np.sqrt(options.radius_mm**2 - options.rise_mm**2) + _RIDGE_MARGIN_MM
-    line = _extend_line(_through(centres), half)
+    line = _extend_line(_interpolate_line(centres), half)
     tangents = np.gradient(line[:, :2], axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     outwards = np.column_stack([-tangents[:, 1], tangents[:, 0], np.zeros(len(line))])
@@ -164,7 +164,7 @@ def _ridge(options: SphereArchOptions, centres: Float[np.ndarray, "n 3"]) -> Man
     return _solid(rings.reshape(-1, 3), _tube(len(line))).refine_to_length(_RIDGE_EDGE_MM)
 
 
-def _through(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+def _interpolate_line(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """A smooth line through the centres, finely sampled."""
     run = lengths_along(centres)
     return np.asarray(CubicSpline(run, centres)(np.linspace(0, run[-1], round(run[-1] / _RIDGE_STEP_MM))))

@@ -138,7 +138,7 @@ def _midline(solid: Solid, points: dict[str, Point]) -> Point:
 
 def _incisive_papilla(solid: Solid) -> Point:
     """The point of the palatal gum behind the contact of the central incisors."""
-    midpoint, lingual = _between_centrals(solid)
+    midpoint, lingual = _midpoint_of_centrals(solid)
     level = np.mean([placed.origin[2] for placed in solid.teeth if placed.position == 1])
     start = np.array([[*midpoint[:2], level + PAPILLA_ABOVE_MM]])
     return _first_inside(solid, start + 12.0 * lingual, -lingual, 12.0)[0]
@@ -146,7 +146,7 @@ def _incisive_papilla(solid: Solid) -> Point:
 
 def _lingual_papilla(solid: Solid) -> Point:
     """The tip of the gum between the central incisors, seen from lingual and above."""
-    midpoint, lingual = _between_centrals(solid)
+    midpoint, lingual = _midpoint_of_centrals(solid)
     lean = np.radians(PAPILLA_LEAN_DEG)
     towards = lingual * np.sin(lean) + [0.0, 0.0, np.cos(lean)]
     along, best = np.linspace(-1.0, 4.0, 26), midpoint
@@ -159,7 +159,7 @@ def _lingual_papilla(solid: Solid) -> Point:
     return best
 
 
-def _between_centrals(solid: Solid) -> tuple[Point, Point]:
+def _midpoint_of_centrals(solid: Solid) -> tuple[Point, Point]:
     """The point between the central incisors where they are equally near, and the lingual direction there."""
     one, other = (placed for placed in solid.teeth if placed.position == 1)
     ends = [placed.to_jaw(np.array([0.0, 0.0, 0.4 * placed.tooth.crown.height_mm])) for placed in (one, other)]

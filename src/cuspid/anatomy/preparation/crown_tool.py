@@ -67,7 +67,7 @@ class FinishLine:
 def crown_tool(site: ToothSite, shape: CrownShape) -> Tool:
     """The tool for a crown preparation. Raises InputError where it leaves no stump."""
     line = finish_line(site, shape.above_gum_mm)
-    top = _reduced_top(site, shape)
+    top = _reduce_top(site, shape)
     profiles = _profiles(site, shape, line, top)
     return _tool(site, line, profiles)
 
@@ -136,7 +136,7 @@ def _reach_to_border(site: ToothSite, side: float, height: float) -> float | Non
     return min(reaches, default=None)
 
 
-def _reduced_top(site: ToothSite, shape: CrownShape) -> Heights:
+def _reduce_top(site: ToothSite, shape: CrownShape) -> Heights:
     surface = site.table if site.kind in ("premolar", "molar") else site.edge
     return lambda x, y: surface(x, y) - shape.occlusal_mm
 

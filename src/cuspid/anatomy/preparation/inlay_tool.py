@@ -63,7 +63,7 @@ def inlay_tool(site: ToothSite, shape: InlayShape) -> Tool:
     plan = inlay_plan(site, shape)
     high = float(site.surface.vertices[:, 2].max()) + 2.0
     inside = [_slot(plan, shape, high)] + [_box(plan, shape, end, high) for end in (0, 1)]
-    outside = [_opening(plan, shape, end, high) for end in (0, 1) if plan.covered[end]]
+    outside = [_proximal_clearance(plan, shape, end, high) for end in (0, 1) if plan.covered[end]]
     cavity = manifold3d.Manifold.batch_boolean(inside, manifold3d.OpType.Add).as_original()
     whole = manifold3d.Manifold.batch_boolean([cavity, *outside], manifold3d.OpType.Add)
     whole = whole.refine_to_length(0.4)
@@ -180,7 +180,7 @@ def _box(plan: InlayPlan, shape: InlayShape, end: int, high: float) -> manifold3
     return manifold3d.Manifold.hull_points(np.concatenate(points))
 
 
-def _opening(plan: InlayPlan, shape: InlayShape, end: int, high: float) -> manifold3d.Manifold:
+def _proximal_clearance(plan: InlayPlan, shape: InlayShape, end: int, high: float) -> manifold3d.Manifold:
     """What is cleared beyond the hidden proximal end of a box: the rest of the contact, and a sulcus in the gum."""
     sign, tilt = (-1.0, 1.0)[end], np.tan(np.deg2rad(shape.divergence_deg))
     near, far = plan.proximal_x[end], plan.outer_x[end]

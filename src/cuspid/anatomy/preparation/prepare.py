@@ -264,7 +264,7 @@ def _assemble_jaw(jaw: Jaw, preparations: Mapping[int, PreparationOptions], tool
         bottom = tools[fdi].line
         if bottom is not None:
             lines[f"{fdi}.{name}_bottom"] = bottom
-        standing = (cut.source == -2 - index) | _apart(cut.mesh, (labels == fdi) & kept)
+        standing = (cut.source == -2 - index) | _detached_faces(cut.mesh, (labels == fdi) & kept)
         labels = _facets(cut.mesh, labels, standing, fdi)
     mesh = Mesh(cut.mesh.vertices, cut.mesh.faces).submesh(kept)
     if jaw.mesh.colors is not None:
@@ -273,7 +273,7 @@ def _assemble_jaw(jaw: Jaw, preparations: Mapping[int, PreparationOptions], tool
     return replace(jaw, mesh=mesh, face_labels=labels[kept], lines=lines)
 
 
-def _apart(mesh: Mesh, mine: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "f"]:
+def _detached_faces(mesh: Mesh, mine: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "f"]:
     """Faces of a tooth that no longer hang together with most of it: what is left of its side of a contact."""
     pairs = neighbours_of(mesh.faces)
     patch = parts_of(pairs[mine[pairs].all(axis=1)], len(mine))

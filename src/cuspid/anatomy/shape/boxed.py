@@ -73,14 +73,10 @@ def box_crowns(jaw: Jaw, options: BoxOptions = BoxOptions()) -> Jaw:
     joined = manifold3d.Manifold.batch_boolean([body, *boxes], manifold3d.OpType.Add)
     outside = max(joined.decompose(), key=lambda part: part.volume())
     out = outside.to_mesh64()
-    numbers = dict(zip((_origin(solid) for solid in boxes), jaw.teeth, strict=True))
+    numbers = dict(zip((int(solid.to_mesh64().run_original_id[0]) for solid in boxes), jaw.teeth, strict=True))
     labels = [np.full(length, numbers[run]) if run in numbers else before[face] for run, length, face in _runs(out)]
     mesh = Mesh(np.asarray(out.vert_properties)[:, :3], np.asarray(out.tri_verts).astype(np.int64))
     return Jaw(mesh=mesh, face_labels=np.concatenate(labels), arch=jaw.arch)
-
-
-def _origin(solid: manifold3d.Manifold) -> int:
-    return int(solid.to_mesh64().run_original_id[0])
 
 
 def _runs(out: manifold3d.Mesh64) -> list[tuple[int, int, Int[np.ndarray, "_"]]]:

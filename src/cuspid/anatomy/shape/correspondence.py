@@ -103,7 +103,7 @@ class Template:
             edge_mm=float(np.linalg.norm(ends, axis=2).mean()),
             inner=inner,
             borders={(int(a), int(b)): np.flatnonzero((low == a) & (high == b)) for a, b in adjacent},
-            averaging=_averaging(mesh.faces, count),
+            averaging=_averaging_matrix(mesh.faces, count),
         )
 
     def smooth(
@@ -125,7 +125,7 @@ class Template:
         return np.asarray(total[:, :3] / np.maximum(total[:, 3:], _LEAST_WEIGHT))
 
 
-def _averaging(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
+def _averaging_matrix(faces: Int[np.ndarray, "f 3"], count: int) -> csr_array:
     sides = edges_of(faces)
     both = np.concatenate([sides, sides[:, ::-1]])
     adjacency = csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
@@ -212,7 +212,7 @@ def partners(
     offsets, found = np.zeros_like(vertices), np.zeros(len(vertices), dtype=bool)
     for label, inner in template.inner.items():
         if label in target.patches and len(inner):
-            offsets[inner], found[inner] = _onto_patch(
+            offsets[inner], found[inner] = _project_onto_patch(
                 vertices[inner], normals[inner], target.patches[label], options.min_cosine
             )
     for border, on_border in template.borders.items():
@@ -224,7 +224,7 @@ def partners(
     return np.where(found[:, None], offsets, 0.0), found
 
 
-def _onto_patch(
+def _project_onto_patch(
     points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"], patch: Patch, min_cosine: float
 ) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, "p"]]:
     distances, faces, nearest = patch.mesh.closest(points)

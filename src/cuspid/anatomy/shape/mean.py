@@ -109,7 +109,7 @@ def common_landmarks(jaws: Mapping[str, Jaw]) -> tuple[str, ...]:
     common = sorted(set.intersection(*named.values()))
     if len(common) < 3:
         union = set.union(*named.values())
-        lacking = "; ".join(f"{name} lacks {_some(union - own)}" for name, own in named.items() if union - own)
+        lacking = "; ".join(f"{name} lacks {_abbreviate(union - own)}" for name, own in named.items() if union - own)
         raise InputError(
             f"mean shape: the jaws have {len(common)} landmarks in common, but at least three are needed: "
             f"{lacking or 'no jaw has any'}; place the missing ones or leave that jaw out"
@@ -117,13 +117,13 @@ def common_landmarks(jaws: Mapping[str, Jaw]) -> tuple[str, ...]:
     for name, jaw in jaws.items():
         if dimension(_positions(jaw, tuple(common))) < 2:
             raise InputError(
-                f"mean shape: the {len(common)} landmarks common to all jaws ({_some(set(common))}) are collinear in "
-                f"{name}; place more landmarks"
+                f"mean shape: the {len(common)} landmarks common to all jaws ({_abbreviate(set(common))}) are collinear"
+                f" in {name}; place more landmarks"
             )
     return tuple(common)
 
 
-def _some(labels: set[str]) -> str:
+def _abbreviate(labels: set[str]) -> str:
     """At most four labels, and how many more."""
     shown = sorted(labels)[:4]
     return ", ".join(shown) + (f" and {len(labels) - len(shown)} more" if len(labels) > len(shown) else "")
@@ -210,7 +210,7 @@ def _model(
     weights = vertex_areas(mean) / mean.face_areas.sum()
     scores, modes, deviations, shares = principal_modes(offsets, weights, options.modes)
     if len(modes) == 0:
-        raise InputError(f"mean shape: {_some(set(samples.jaws))} are all the same jaw; give jaws that differ")
+        raise InputError(f"mean shape: {_abbreviate(set(samples.jaws))} are all the same jaw; give jaws that differ")
     at_landmarks = np.einsum("nk,nld->kld", scores, samples.pose.aligned - samples.pose.mean) / (len(scores) - 1)
     landmarks = {label: Landmark(point) for label, point in zip(samples.labels, samples.pose.mean, strict=True)}
     return ShapeModel(
@@ -271,7 +271,7 @@ def _notes(samples: _Samples, first: str) -> tuple[str, ...]:
             notes.append(f"tooth {extra} of {name} is not in the mean, because {first} does not have it")
     left_out = set().union(*(jaw.landmarks for jaw in samples.jaws.values())) - set(samples.labels)
     if left_out:
-        notes.append(f"landmarks missing from some jaws were left out: {_some(left_out)}")
+        notes.append(f"landmarks missing from some jaws were left out: {_abbreviate(left_out)}")
     if not samples.by_tooth:
         notes.append("some jaws have no tooth labels: corresponding points were found without them")
     return tuple(notes)

@@ -45,7 +45,7 @@ def _radial(model, k, r2):
 
 @kernel
 @no_type_check
-def _sideways(model, k):
+def _decentering(model, k):
     """p1, p2, s1, s2."""
     if model in (_OPENCV_FISHEYE, _SPLINED):
         return 0.0, 0.0, 0.0, 0.0
@@ -123,7 +123,7 @@ def distort(model, k, u, v):
     if model == _SPLINED:
         x, y, _, _, _, _ = _shift(k, u, v)
         return u * radial + x, v * radial + y
-    p1, p2, s1, s2 = _sideways(model, k)
+    p1, p2, s1, s2 = _decentering(model, k)
     return (
         u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + s1 * r2,
         v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + s2 * r2,
@@ -132,7 +132,7 @@ def distort(model, k, u, v):
 
 @kernel
 @no_type_check
-def _by_ideal(model, k, u, v):
+def _ideal_derivatives(model, k, u, v):
     """Derivatives of :func:`distort` by u and v: of the first by both, then of the second."""
     r2 = u * u + v * v
     radial, slope, _ = _radial(model, k, r2)
@@ -140,7 +140,7 @@ def _by_ideal(model, k, u, v):
         _, _, xu, xv, yu, yv = _shift(k, u, v)
         cross = 2 * u * v * slope
         return radial + 2 * u * u * slope + xu, cross + xv, cross + yu, radial + 2 * v * v * slope + yv
-    p1, p2, s1, s2 = _sideways(model, k)
+    p1, p2, s1, s2 = _decentering(model, k)
     cross = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v
     return (
         radial + 2 * u * u * slope + 2 * p1 * v + 6 * p2 * u + 2 * s1 * u,
@@ -152,7 +152,7 @@ def _by_ideal(model, k, u, v):
 
 @kernel
 @no_type_check
-def _by_control(k, u, v, by_parameters):
+def _control_derivatives(k, u, v, by_parameters):
     """Derivatives by the reach and the control points of a splined lens."""
     _, _, xu, xv, yu, yv = _shift(k, u, v)
     by_parameters[0, _REACH] = -k[0] * (xu * u + xv * v) / k[_REACH]
@@ -181,7 +181,7 @@ def camera_jacobian(model, k, x, y, z, pixel, by_point, by_parameters):
     u, v = _ideal(model, x, y, z)
     xd, yd = distort(model, k, u, v)
     pixel[0], pixel[1] = fx * xd + k[2], fy * yd + k[3]
-    xu, xv, yu, yv = _by_ideal(model, k, u, v)
+    xu, xv, yu, yv = _ideal_derivatives(model, k, u, v)
     if model <= _FULL_OPENCV:
         by_point[0, 0], by_point[0, 1] = fx * xu / z, fx * xv / z
         by_point[1, 0], by_point[1, 1] = fy * yu / z, fy * yv / z
@@ -214,7 +214,7 @@ def camera_jacobian(model, k, x, y, z, pixel, by_point, by_parameters):
         by_parameters[0, 6], by_parameters[1, 6] = a * r2 * r2, b * r2 * r2
         by_parameters[0, 7], by_parameters[1, 7] = a * r2 * r2 * r2, b * r2 * r2 * r2
         if model == _SPLINED:
-            _by_control(k, u, v, by_parameters)
+            _control_derivatives(k, u, v, by_parameters)
         return
     by_parameters[0, 6], by_parameters[1, 6] = fx * 2 * u * v, fy * (r2 + 2 * v * v)
     by_parameters[0, 7], by_parameters[1, 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v
@@ -267,7 +267,7 @@ def _invert_distortion(model, k, limit, a, b):
         if length > limit:
             u, v = _INSIDE * u * limit / length, _INSIDE * v * limit / length
         xd, yd = distort(model, k, u, v)
-        xu, xv, yu, yv = _by_ideal(model, k, u, v)
+        xu, xv, yu, yv = _ideal_derivatives(model, k, u, v)
         determinant = xu * yv - xv * yu
         step_u, step_v = (yv * (xd - a) - xv * (yd - b)) / determinant, (xu * (yd - b) - yu * (xd - a)) / determinant
         if not np.isfinite(step_u + step_v):

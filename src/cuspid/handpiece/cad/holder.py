@@ -46,17 +46,20 @@ def with_holder(handpiece: Handpiece, options: HolderOptions = HolderOptions()) 
     cameras = {name: module(each.cam_from_rig, options.camera_mm) for name, each in handpiece.rig.cameras.items()}
     lights = {name: module(each.light_from_rig, options.led_mm) for name, each in handpiece.lights.items()}
     modules = [*cameras.values(), *lights.values()]
-    plates = [_plate(handpiece, group, modules, options) for group in alike(handpiece)]
+    plates = [_plate(handpiece, group, modules, options) for group in group_by_direction(handpiece)]
     parts: dict[str, Box] = {f"camera {name}": box for name, box in cameras.items()}
     parts |= {f"light {name}": box for name, box in lights.items()}
     parts |= {f"plate {number}": plate for number, plate in enumerate(plates, start=1)}
-    parts |= {f"bar {number}": bar for number, bar in enumerate(_bars(plates, modules, options), start=1)}
+    parts |= {
+        f"bar {number}": bar
+        for number, bar in enumerate([_bar(plates[0], other, modules, options) for other in plates[1:]], start=1)
+    }
     if options.neck_mm:
         parts["neck"] = _neck(plates[0], options)
     return replace(handpiece, body=Body(parts))
 
 
-def alike(handpiece: Handpiece) -> list[list[str]]:
+def group_by_direction(handpiece: Handpiece) -> list[list[str]]:
     """Cameras by the way they look, in the order of the rig."""
     groups: list[list[str]] = []
     for name, mounted in handpiece.rig.cameras.items():
@@ -95,11 +98,6 @@ def _belongs(box: Box, group_from_rig: Rigid3, reach: Float[np.ndarray, "2 3"], 
     sideways = (reach[1] - reach[0])[:2].max() / 2
     inside = np.all(middle > reach[0] - sideways) and np.all(middle < reach[1] + sideways)
     return bool(inside and box.box_from_rig.rotation[2] @ axis > np.cos(np.deg2rad(ALIKE_DEG)))
-
-
-def _bars(plates: Sequence[Box], modules: Sequence[Box], options: HolderOptions) -> list[Box]:
-    """Bars from the first plate to each of the others, behind all modules between."""
-    return [_bar(plates[0], other, modules, options) for other in plates[1:]]
 
 
 def _bar(one: Box, other: Box, modules: Sequence[Box], options: HolderOptions) -> Box:

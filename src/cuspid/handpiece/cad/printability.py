@@ -97,7 +97,9 @@ def check_seats(made: Printable, options: PrintOptions) -> None:
     modules = module_boxes(made.handpiece)
     blocks = {name: block(box) for name, box in modules.items()}
     reach_mm = options.web_mm + 4 * options.seat_clearance_mm
-    near = [pair for pair in combinations(modules, 2) if _apart_mm(*(modules[name] for name in pair)) < reach_mm]
+    near = [
+        pair for pair in combinations(modules, 2) if _ball_clearance_mm(*(modules[name] for name in pair)) < reach_mm
+    ]
     for one, other in near:
         if (blocks[one] ^ blocks[other]).volume() > NOTHING_MM3:
             raise InputError(
@@ -121,7 +123,7 @@ def check_seats(made: Printable, options: PrintOptions) -> None:
             )
 
 
-def _apart_mm(one: Box, other: Box) -> float:
+def _ball_clearance_mm(one: Box, other: Box) -> float:
     """Least distance that the balls around two boxes keep."""
     centres = [box.box_from_rig.inverse().translation for box in (one, other)]
     reach = np.linalg.norm(one.half_mm) + np.linalg.norm(other.half_mm)
@@ -135,12 +137,12 @@ def check_solid(made: Printable) -> None:
     found = pieces(made.solid)
     if len(found) > 1:
         raise InputError(
-            f"holder: it falls into {len(found)} pieces, one around {_where(made, found[1])}; make --arm-width-mm, "
+            f"holder: it falls into {len(found)} pieces, one around {_part_of(made, found[1])}; make --arm-width-mm, "
             "--neck-width-mm or the walls larger, or rearrange the cameras"
         )
     for one, other in pairwise(pieces(union(made.hollows))):
         raise InputError(
-            f"holder: a cable cannot pass from {_where(made, other)} to {_where(made, one)}; make --duct-mm or "
+            f"holder: a cable cannot pass from {_part_of(made, other)} to {_part_of(made, one)}; make --duct-mm or "
             "--arm-width-mm larger"
         )
     stored = trimesh.Trimesh(made.mesh.vertices.astype(np.float32), made.mesh.faces)
@@ -150,7 +152,7 @@ def check_solid(made: Printable) -> None:
         )
 
 
-def _where(made: Printable, piece: Manifold) -> str:
+def _part_of(made: Printable, piece: Manifold) -> str:
     """The part in which a piece lies."""
     low, high = np.reshape(piece.bounding_box(), (2, 3))
     parts = made.handpiece.solid

@@ -220,7 +220,7 @@ def views_of(made: Printable) -> tuple[Mesh, Mesh, Mesh]:
 
 
 def surface(solid: Manifold) -> Mesh:
-    """Of a solid."""
+    """The surface of a solid as a mesh."""
     made = solid.to_mesh64()
     return Mesh(np.asarray(made.vert_properties)[:, :3], np.asarray(made.tri_verts).astype(np.int64))
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.geometry import Rigid3, unit
-from cuspid.handpiece.cad.holder import ALIKE_DEG, alike, spans
+from cuspid.handpiece.cad.holder import ALIKE_DEG, group_by_direction, spans
 from cuspid.model.body import Body, Box
 from cuspid.model.rig import Handpiece
 from cuspid.runtime.errors import InputError
@@ -207,7 +207,7 @@ def _groups(handpiece: Handpiece, modules: Mapping[str, Box]) -> list[tuple[Rigi
     """Cameras that look the same way, with the lights that shine most nearly that way; other lights by themselves."""
     groups: list[tuple[Rigid3, dict[str, Box]]] = [
         (handpiece.rig[names[0]].cam_from_rig, {f"camera {name}": modules[f"camera {name}"] for name in names})
-        for names in alike(handpiece)
+        for names in group_by_direction(handpiece)
     ]
     for name in (f"light {each}" for each in handpiece.lights):
         frame = modules[name].box_from_rig
@@ -302,8 +302,8 @@ def _elbow(one: Head, other: Head) -> Float[np.ndarray, "3"]:
     middle = starts.mean(axis=0)
     if np.linalg.norm(np.cross(*normals)) < np.sin(np.deg2rad(10)):
         return middle
-    wanted = np.sum(normals * (starts - middle), axis=1)
-    elbow = middle + np.linalg.lstsq(normals, wanted, rcond=None)[0]
+    offsets = np.sum(normals * (starts - middle), axis=1)
+    elbow = middle + np.linalg.lstsq(normals, offsets, rcond=None)[0]
     far = np.linalg.norm(starts - elbow, axis=1).max() > _FAR_ELBOW * np.linalg.norm(starts[0] - starts[1])
     return middle if far else np.asarray(elbow)
 

@@ -34,7 +34,7 @@ class BoardPattern(Options):
     """What is printed on a board, whatever its size."""
 
     kind: BoardKind = "charuco"
-    """Squares with markers (charuco), which tell the corners apart, so that the board may be seen in part, or without
+    """Squares with markers (charuco), which identify the corners, so that the board may be seen in part, or without
     (chessboard); Kalibr's tags (aprilgrid), which may be seen in part, too; dots in a square grid (circles) or in rows
     that are shifted by half a step (asymmetric-circles)."""
     columns: Annotated[int, Range(2, 100)] = 8
@@ -93,7 +93,7 @@ class Board(BoardPattern):
 
     @property
     def has_markers(self) -> bool:
-        """Whether markers tell its corners apart, so that it may be seen in part."""
+        """Whether markers identify its corners, so that it may be seen in part."""
         return self.kind in ("charuco", "aprilgrid")
 
     @property
@@ -207,7 +207,7 @@ class Board(BoardPattern):
 
     @computed_once
     def orders(self) -> Int[np.ndarray, "k n"]:
-        """The numberings of the corners that an image of the board does not tell apart, the usual one first: rotated by
+        """The numberings of the corners that an image of the board cannot distinguish, the usual one first: rotated by
         half a turn if it has no markers, by quarter turns if it is also square."""
         if self.has_circles:
             return turned_orders(self._circles_mm / self.square_mm)

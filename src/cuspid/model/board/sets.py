@@ -1,5 +1,5 @@
 """Several boards that are fixed to one another, nobody knows how: what a rig is calibrated from where no camera sees
-all that another one sees. Each is told by the ids of its markers.
+all that another one sees. The ids of its markers identify each.
 
 Corners are numbered from board to board, each in the frame of its own board.
 """
@@ -28,7 +28,8 @@ class BoardSet:
         for number, board in enumerate(self.boards, 1):
             if not board.has_markers:
                 raise InputError(
-                    f"boards: number {number} is a {board.kind}, which nothing tells from the others; several boards "
+                    f"boards: number {number} is a {board.kind}, which cannot be distinguished from the others; "
+                    f"several boards "
                     "need markers (charuco, aprilgrid)"
                 )
             if board.terraces > 1:
@@ -43,7 +44,7 @@ class BoardSet:
 
     @property
     def has_circles(self) -> bool:
-        """Circles tell no boards apart."""
+        """Circles do not identify a board."""
         return False
 
     @property
@@ -68,7 +69,7 @@ class BoardSet:
 
     @computed_once
     def orders(self) -> Int[np.ndarray, "1 n"]:
-        """Markers tell all corners apart."""
+        """Markers identify all corners."""
         return np.arange(len(self.corners))[None]
 
     @property

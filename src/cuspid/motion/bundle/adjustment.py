@@ -11,7 +11,7 @@ Unknowns and how a step changes them:
 
 Where a row is exposed a time t after the instant of its frame (:mod:`cuspid.model.shutter`), X is seen at
 ``cam_from_rig[c] @ exp(t v) @ rig_from_world[f] @ X``, to first order in t. The motion v in the frame follows from the
-poses before and after it; it is held while the minimum is sought, and both are found in turn.
+poses before and after it; it is fixed while the minimum is sought, and both are found in turn.
 
 Levenberg-Marquardt on the Huber loss of the residuals in units of their standard deviation. The points are eliminated
 (Schur complement); what remains is a dense system of 6 unknowns a frame and 14 to 18 a camera. After each step the
@@ -41,7 +41,7 @@ from cuspid.model.shutter import film_times, motions
 from cuspid.model.sparse_model import SparseModel
 from cuspid.model.unrolling import is_rolling
 from cuspid.motion.bundle.expectation import MOST_POINTS, covariance_factor, expectation_of, steps_drawn
-from cuspid.motion.bundle.gauge import PLACE, best_gauge, gauge_basis, moved_places, moved_world
+from cuspid.motion.bundle.gauge import PLACE, best_gauge, gauge_basis, transform_mounts, transform_world
 from cuspid.motion.bundle.misfit import CHANCE, held_misfit
 from cuspid.motion.bundle.normal_equations import (
     POSE,
@@ -50,12 +50,12 @@ from cuspid.motion.bundle.normal_equations import (
     System,
     Weighting,
     influence,
+    move_poses,
     normal_equations,
     refine_points,
     residual_vectors,
     scatter_of_tracks,
     substitute,
-    with_poses_moved,
 )
 from cuspid.runtime.errors import ReconstructionError
 from cuspid.runtime.options import Options, Range
@@ -222,13 +222,13 @@ def _apply_step(state: State, observations: Observations, weighting: Weighting, 
     """The state after a step of poses and calibration, with the points where their rays then meet."""
     size = POSE * (len(state.frame_rotation) - 1)
     points = substitute(state, observations, weighting, step[:, None])[0]
-    moved = with_poses_moved(state, step[:size])._replace(points=points)
+    moved = move_poses(state, step[:size])._replace(points=points)
     if weighting.calibrated:
         moved = _with_calibration(moved, prior, state.whitened + step[size:].reshape(state.whitened.shape))
-    return _in_front(refine_points(moved, observations, weighting), state.points, observations)
+    return _restore_in_front(refine_points(moved, observations, weighting), state.points, observations)
 
 
-def _in_front(state: State, before: Float[np.ndarray, "p 3"], observations: Observations) -> State:
+def _restore_in_front(state: State, before: Float[np.ndarray, "p 3"], observations: Observations) -> State:
     """A state in which points that went behind a camera are where they were before: one such point, whose rays hardly
     meet, must not hold up the others."""
     lost = ~np.isfinite(residual_vectors(state, observations)).all(axis=1)
@@ -265,15 +265,15 @@ def _solve(system: System, damping: float) -> Float[np.ndarray, "n"] | None:
         return None
 
 
-def _at_best_gauge(state: State, prior: _Prior) -> State:
+def _apply_best_gauge(state: State, prior: _Prior) -> State:
     """The state with the least cost of the prior among those that all images see alike."""
     for _ in range(_GAUGE_STEPS):
         gauge = best_gauge(state)
         whitened = state.whitened.copy()
-        whitened[:, :PLACE] = prior.whitened_places(*moved_places(state, gauge))
+        whitened[:, :PLACE] = prior.whitened_places(*transform_mounts(state, gauge))
         if not np.sum(whitened**2) < (1 - 1e-9) * np.sum(state.whitened**2):
             break
-        state = _with_calibration(moved_world(state, gauge), prior, whitened)
+        state = _with_calibration(transform_world(state, gauge), prior, whitened)
     return state
 
 
@@ -308,7 +308,7 @@ def _minimise(
         lower = np.inf if step is None else _cost(candidate, observations, weighting)
         settled = decrease < options.tolerance
         if lower <= cost:
-            state, damping = _at_best_gauge(candidate, prior), max(damping / 10, _LEAST_DAMPING)
+            state, damping = _apply_best_gauge(candidate, prior), max(damping / 10, _LEAST_DAMPING)
             cost = _cost(state, observations, weighting) if weighting.calibrated else lower
         else:
             damping *= 10
@@ -384,7 +384,7 @@ def _good(state: State, observations: Observations, limit_px: float, min_angle_d
     return near & (seen & wide)[point]
 
 
-def _sorted_by_point(tracks: Tracks, keep: Bool[np.ndarray, "o"]) -> tuple[Observations, Int[np.ndarray, "p"]]:
+def _sort_by_point(tracks: Tracks, keep: Bool[np.ndarray, "o"]) -> tuple[Observations, Int[np.ndarray, "p"]]:
     """The kept observations sorted by point, and the indices of the points that still have any."""
     order = np.flatnonzero(keep)
     order = order[np.argsort(tracks.point_index[order], kind="stable")]
@@ -404,7 +404,7 @@ def _select(
     state: State, observations: Observations, colors: Any, keep: Bool[np.ndarray, "o"]
 ) -> tuple[State, Observations, Any]:
     """State, observations and colours without what is not kept."""
-    kept, points = _sorted_by_point(_as_tracks(state, observations, colors), keep)
+    kept, points = _sort_by_point(_as_tracks(state, observations, colors), keep)
     return state._replace(points=state.points[points]), kept, colors[points]
 
 
@@ -441,7 +441,7 @@ def residuals_px(reconstruction: Reconstruction) -> Float[np.ndarray, "o 2"]:
     tracks = reconstruction.tracks
     if tracks is None:
         return np.zeros((0, 2))
-    observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
+    observations, points = _sort_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
     poses = tuple(reconstruction.rig_from_world.values())
     times = _times(reconstruction.rig, reconstruction.frames)
     state = _initial_state(poses, tracks.points[points], _Prior.of(reconstruction.rig), times)
@@ -497,12 +497,12 @@ def _inverse(
     """``(by_images + prior)^-1 (scatter + prior) (by_images + prior)^-1``. What images tell is up to 1e15 times what
     the prior does, but of a similarity they tell nothing: there it is set to 0, instead of to what rounding leaves."""
     basis, blind = gauge_basis(state) if prior.any() else (np.eye(len(prior)), 0)
-    told, scattered = (basis.T @ matrix @ basis for matrix in (by_images, scatter))
-    for matrix in (told, scattered):
+    information, scattered = (basis.T @ matrix @ basis for matrix in (by_images, scatter))
+    for matrix in (information, scattered):
         matrix[len(matrix) - blind :] = 0
         matrix[:, len(matrix) - blind :] = 0
     held = basis.T @ prior @ basis
-    factor = cho_factor(told + held, lower=True)
+    factor = cho_factor(information + held, lower=True)
     inverse = cho_solve(factor, cho_solve(factor, scattered + held).T)
     return np.asarray(basis @ inverse @ basis.T)
 
@@ -631,7 +631,7 @@ def _minimize(
     if tracks is None or len(tracks.point_index) == 0:
         raise ReconstructionError("adjustment: no tracks to adjust; more texture or more overlap is needed")
     prior = _Prior.of(rig)
-    observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
+    observations, points = _sort_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
     state, colors = _initial_state(poses, tracks.points[points], prior, times), tracks.colors[points]
     sigma_px, limit_px, steps = options.sigma_px, options.start_px, 0
     for _ in range(options.rounds):
@@ -670,10 +670,10 @@ def _misfits(
 ) -> tuple[str, ...]:
     """Whether the images fit what is held of the calibration: all that was matched, for of a camera that is far off
     everything is dropped."""
-    observations, points = _sorted_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
+    observations, points = _sort_by_point(tracks, np.ones(len(tracks.point_index), dtype=bool))
     state = found._replace(points=tracks.points[points])
     for _ in range(2):
-        state = _in_front(refine_points(state, observations, weighting), state.points, observations)
+        state = _restore_in_front(refine_points(state, observations, weighting), state.points, observations)
         keep = _good(state, observations, options.start_px, options.min_angle_deg)
         state, observations, _ = _select(state, observations, np.zeros((len(state.points), 3), np.uint8), keep)
     return held_misfit(refine_points(state, observations, weighting), observations, weighting, prior.rig.names)

@@ -83,7 +83,7 @@ def _free_similarities(state: State) -> tuple[Float[np.ndarray, "7 m"], Float[np
 
 def _pose_steps(state: State, direction: Float[np.ndarray, "7"]) -> Float[np.ndarray, "f 6"]:
     """Small motions on the left of all poses but the first, per unit of a similarity."""
-    ahead, back = (moved_world(state, Gauge.of(sign * _SMALL * direction)) for sign in (1, -1))
+    ahead, back = (transform_world(state, Gauge.of(sign * _SMALL * direction)) for sign in (1, -1))
     turn = ahead.frame_rotation @ np.swapaxes(back.frame_rotation, 1, 2)
     shift = ahead.frame_translation - np.einsum("fij,fj->fi", turn, back.frame_translation)
     steps = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), shift], axis=1) / (2 * _SMALL)
@@ -108,7 +108,7 @@ def _split(basis: Float[np.ndarray, "6 6"]) -> tuple[Float[np.ndarray, "6 6"], F
     return inverse / unit, left.T[~allowed] / unit
 
 
-def moved_world(state: State, gauge: Gauge) -> State:
+def transform_world(state: State, gauge: Gauge) -> State:
     """Poses and points of a state after a gauge change, with the first frame where it was; the caller moves the
     cameras."""
     rotation = gauge.turn @ state.frame_rotation
@@ -128,7 +128,7 @@ def moved_world(state: State, gauge: Gauge) -> State:
     )
 
 
-def moved_places(state: State, gauge: Gauge) -> tuple[Float[np.ndarray, "c 3 3"], Float[np.ndarray, "c 3"]]:
+def transform_mounts(state: State, gauge: Gauge) -> tuple[Float[np.ndarray, "c 3 3"], Float[np.ndarray, "c 3"]]:
     """Rotations and translations of ``cam_from_rig`` after a gauge change."""
     rotation = state.camera_rotation @ gauge.turn.T
     return rotation, gauge.scale * state.camera_translation - rotation @ gauge.shift

@@ -1,4 +1,4 @@
-"""What the uncertainty of a calibration that is held does to depth.
+"""How the uncertainty of a fixed calibration propagates to depth.
 
 Of a place p that cameras c see at u_c = f(p, x_c), an error dx_c of what is known of them moves it by
 A^-1 sum J_c^T K_c dx_c, with the Jacobians J_c = df/dp and K_c = df/dx_c, and A = sum J_c^T J_c: least squares, to

@@ -31,12 +31,12 @@ from cuspid.motion.bundle.normal_equations import (
     System,
     Weighting,
     influence,
+    move_poses,
     normal_equations,
     refine_points,
     residual_vectors,
     scatter_of_tracks,
     substitute,
-    with_poses_moved,
 )
 from cuspid.runtime.workers import computed_once
 
@@ -52,7 +52,7 @@ _OBSERVABLE = 1e-3
 
 
 class ScoreTest(NamedTuple):
-    """How the images pull at the parameters that are held fixed, once the rest has followed."""
+    """Score of the fixed parameters, with all others at their optimum."""
 
     score: Float[np.ndarray, "k"]
     curvature: Float[np.ndarray, "k k"]
@@ -91,7 +91,7 @@ class _Numbers:
         return np.asarray(cho_factor(self.hessian[np.ix_(~self.held, ~self.held)], lower=True)[0])
 
     @computed_once
-    def _onto_held(self) -> Float[np.ndarray, "k n"]:
+    def _reduced_gradient(self) -> Float[np.ndarray, "k n"]:
         """What is left of a gradient for the held numbers once the rest has followed."""
         onto = np.zeros((np.count_nonzero(self.held), len(self.held)))
         following = cho_solve((self._rest, True), self.hessian[np.ix_(~self.held, self.held)])
@@ -100,13 +100,13 @@ class _Numbers:
 
     def score_test(self, raw_scatter: Float[np.ndarray, "n n"]) -> ScoreTest:
         """With how the gradients of the tracks scatter."""
-        onto, turn = self._onto_held, self.raw_from_numbers
+        onto, turn = self._reduced_gradient, self.raw_from_numbers
         scatter = turn.T @ raw_scatter @ turn + self.prior
         return ScoreTest(onto @ self.gradient, onto @ self.hessian @ onto.T, onto @ scatter @ onto.T)
 
     def raw_step(self) -> Float[np.ndarray, "n"]:
         """To where the images want all unknowns, the held ones within generous tolerances."""
-        onto, step = self._onto_held, np.zeros(len(self.held))
+        onto, step = self._reduced_gradient, np.zeros(len(self.held))
         generous = np.eye(len(onto)) / _GENEROUS**2
         step[self.held] = -np.linalg.solve(onto @ self.hessian @ onto.T + generous, onto @ self.gradient)
         step[~self.held] = -cho_solve((self._rest, True), self.gradient[~self.held])
@@ -164,13 +164,13 @@ def _curvature(raw: State, observations: Observations, weighting: Weighting) -> 
 
 
 def _numbers(
-    state: State, told: System, observations: Observations, weighting: Weighting, held: Bool[np.ndarray, "c n"]
+    state: State, system: System, observations: Observations, weighting: Weighting, held: Bool[np.ndarray, "c n"]
 ) -> _Numbers:
     """What is free of the calibration is counted in standard deviations of its prior, what is held in what is allowed:
     units that move the images by so much."""
-    poses, free = len(told.gradient) - held.size, ~held.ravel()
+    poses, free = len(system.gradient) - held.size, ~held.ravel()
     counts = np.maximum(np.bincount(observations.camera, minlength=len(held)), 1)
-    per_unit_px = weighting.sigma_px * np.sqrt(told.diagonal[poses:].reshape(held.shape) / counts[:, None])
+    per_unit_px = weighting.sigma_px * np.sqrt(system.diagonal[poses:].reshape(held.shape) / counts[:, None])
     units = np.where(held & (per_unit_px > 0), _ALLOWED_PX / np.maximum(per_unit_px, 1e-300), 0.0)
     turn = block_diag(np.eye(poses), *(basis + np.diag(unit) for basis, unit in zip(state.basis, units, strict=True)))
     prior = np.concatenate([np.zeros(poses), free])
@@ -178,8 +178,8 @@ def _numbers(
         raw_from_numbers=turn,
         held=np.concatenate([np.zeros(poses, dtype=bool), ~free]),
         prior=np.diag(prior),
-        hessian=turn.T @ told.matrix @ turn + np.diag(prior),
-        gradient=turn.T @ told.gradient + prior * np.concatenate([np.zeros(poses), state.whitened.ravel()]),
+        hessian=turn.T @ system.matrix @ turn + np.diag(prior),
+        gradient=turn.T @ system.gradient + prior * np.concatenate([np.zeros(poses), state.whitened.ravel()]),
     )
 
 
@@ -195,7 +195,7 @@ def _apply_step(raw: State, observations: Observations, weighting: Weighting, st
     poses = len(step) - raw.whitened.size
     numbers = step[poses:].reshape(raw.whitened.shape)
     turns = Rotation.from_rotvec(numbers[:, :3]).as_matrix()
-    moved = with_poses_moved(raw, step[:poses])._replace(
+    moved = move_poses(raw, step[:poses])._replace(
         camera_rotation=turns @ raw.camera_rotation,
         camera_translation=np.einsum("cij,cj->ci", turns, raw.camera_translation) + numbers[:, 3:POSE],
         intrinsics=raw.intrinsics + numbers[:, POSE : POSE + raw.intrinsics.shape[1]],

@@ -566,7 +566,7 @@ def influence(state: State, observations: Observations, weighting: Weighting) ->
     return float(np.sum(np.minimum(lengths, weighting.huber_sigmas) ** 2)), float(np.mean(slopes))
 
 
-def with_poses_moved(state: State, step: Float[np.ndarray, "n"]) -> State:
+def move_poses(state: State, step: Float[np.ndarray, "n"]) -> State:
     """The state after small motions on the left of all poses except the first."""
     motions = np.vstack([np.zeros((1, POSE)), step.reshape(-1, POSE)])
     turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()

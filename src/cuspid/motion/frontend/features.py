@@ -98,7 +98,7 @@ def _places(keypoints: Sequence[cv2.KeyPoint]) -> Float[np.ndarray, "n 2"]:
     return np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64).reshape(-1, 2)
 
 
-def without_doubles(keypoints: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
+def drop_duplicates(keypoints: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
     """One keypoint for each place and size, in their order; SIFT repeats a place for each of its orientations."""
     kind = np.round(np.column_stack([_places(keypoints), [k.size for k in keypoints]]), 2)
     first, _ = distinct_rows(kind)
@@ -134,7 +134,7 @@ def detect(
     sift = cv2.SIFT.create(contrastThreshold=options.contrast, edgeThreshold=options.edge, enable_precise_upscale=True)
     keypoints = sift.detect(gray, mask)
     if options.upright:
-        keypoints = without_doubles(keypoints)
+        keypoints = drop_duplicates(keypoints)
     most = options.count_for(width, height)
     chosen = select_evenly(px * _places(keypoints), np.array([k.response for k in keypoints]), most, options.cell_px)
     keypoints = [keypoints[index] for index in chosen]
@@ -154,7 +154,7 @@ def _load(path: Path) -> Features:
         return Features(pixels=kept["pixels"], descriptors=kept["descriptors"], colors=kept["colors"])
 
 
-def _where_shown(mask: UInt8[np.ndarray, "h w"] | None, lens: Camera) -> UInt8[np.ndarray, "h w"] | None:
+def _mask_outside_model(mask: UInt8[np.ndarray, "h w"] | None, lens: Camera) -> UInt8[np.ndarray, "h w"] | None:
     """The mask without what the model of the lens has no direction for."""
     if lens.valid_mask is None:
         return mask
@@ -167,7 +167,7 @@ def _detect_kept(
 ) -> Features:
     """Features of one image of a capture, from the results of an earlier run where they are there."""
     lens = pictures.capture.handpiece.rig[camera].camera
-    mask = _where_shown(pictures.capture.source.mask(frame.name, camera), lens)
+    mask = _mask_outside_model(pictures.capture.source.mask(frame.name, camera), lens)
     if stage is None:
         return detect(pictures.image(frame, camera), options, mask)
     path = stage.folder / camera / f"{frame.name}.npz"

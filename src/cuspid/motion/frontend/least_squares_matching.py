@@ -123,7 +123,7 @@ def _facets(views: _Views, tracks: Tracks) -> _Facets:
     return _Facets(own, stencils)
 
 
-def _by_image(tracks: Tracks, observations: Int[np.ndarray, "k"]) -> dict[Image, Int[np.ndarray, "_"]]:
+def _group_by_image(tracks: Tracks, observations: Int[np.ndarray, "k"]) -> dict[Image, Int[np.ndarray, "_"]]:
     """Observations by their images."""
     frame, camera = tracks.frame_index[observations], tracks.camera_index[observations]
     order = np.lexsort((camera, frame))
@@ -150,7 +150,7 @@ class _Matching:
         """Of all points, from their own observations."""
         side = 2 * self.options.radius_px + 3
         patches = np.zeros((len(self.tracks.points), side, side), dtype=np.float32)
-        parts = _by_image(self.tracks, own)
+        parts = _group_by_image(self.tracks, own)
 
         def cut_part(part: tuple[Image, Int[np.ndarray, "_"]]) -> Float32[np.ndarray, "_ s s"]:
             return cut_patches(self.picture(part[0]), self.tracks.pixels[part[1]], self.options.radius_px)
@@ -207,7 +207,7 @@ def match_patches(
         point = tracks.point_index[part[1]]
         return matching.lay(*part, patches[point], facets.stencils[point])
 
-    others = _by_image(tracks, np.setdiff1d(np.arange(len(tracks.point_index)), facets.own))
+    others = _group_by_image(tracks, np.setdiff1d(np.arange(len(tracks.point_index)), facets.own))
     laid = map_in_threads(lay, others.items(), stage="patches", progress=progress)
     pixels, correlation = tracks.pixels.copy(), np.ones(len(tracks.pixels))
     for observations, (places, alike) in zip(others.values(), laid, strict=True):

@@ -101,7 +101,9 @@ class Trajectory:
     """The other frames."""
 
 
-def searched_mm(handpiece: Handpiece, view: IndexedFeatures) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def search_range_mm(
+    handpiece: Handpiece, view: IndexedFeatures
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Least and greatest depth at which each keypoint is sought where nothing is known of it."""
     near, far = handpiece.depth_range_mm
     return np.full(len(view.features), near), np.full(len(view.features), _SEARCHED * far)
@@ -147,7 +149,7 @@ def triangulate_frame(
             continue
         a, b = views[first], views[second]
         second_from_first = rig[second].cam_from_rig @ rig[first].cam_from_rig.inverse()
-        bounds = searched_mm(handpiece, a), searched_mm(handpiece, b)
+        bounds = search_range_mm(handpiece, a), search_range_mm(handpiece, b)
         found = match_guided(a, b, second_from_first, *bounds, options)
         matches.append((first, second, found))
     sizes = [len(view.features) for view in views.values()]

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from cuspid.geometry import Rigid3, unit
 from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
 from cuspid.model.mesh import Mesh
-from cuspid.model.reconstruction import Reconstruction, Tracks, chosen_tracks, joined_tracks
+from cuspid.model.reconstruction import Reconstruction, Tracks, concatenate_tracks, select_tracks
 from cuspid.model.sparse_model import SparseModel
 from cuspid.motion.frontend.tracks import points_across
 from cuspid.runtime.kernels import kernel
@@ -144,13 +144,13 @@ def _template(patch, levels, slopes):
 
 @kernel
 @no_type_check
-def _align(patches, image, there, warps, bends, limit, iterations, shifts, correlations):
+def _align(patches, image, start, warps, bends, limit, iterations, shifts, correlations):
     """Fill in for every patch its shift from where it should be, and the correlation there; NaN where it is lost.
     ``bends`` are empty where the warps are all."""
     radius = patches.shape[1] // 2 - 1
     count = (2 * radius + 1) ** 2
     levels, slopes, found = np.empty(count), np.empty((count, 2)), np.empty(count)
-    for n in range(len(there)):
+    for n in range(len(start)):
         shifts[n] = 0.0
         correlations[n] = np.nan
         spread = _template(patches[n], levels, slopes)
@@ -165,7 +165,7 @@ def _align(patches, image, there, warps, bends, limit, iterations, shifts, corre
         determinant = square[0, 0] * square[1, 1] - square[0, 1] ** 2
         if determinant <= 1e-6 * (square[0, 0] + square[1, 1]) ** 2:
             continue
-        x, y = there[n, 0], there[n, 1]
+        x, y = start[n, 0], start[n, 1]
         for _ in range(iterations):
             k = 0
             for dy in range(-radius, radius + 1):
@@ -184,12 +184,12 @@ def _align(patches, image, there, warps, bends, limit, iterations, shifts, corre
             step_x = (square[1, 1] * off[0] - square[0, 1] * off[1]) / determinant
             step_y = (square[0, 0] * off[1] - square[0, 1] * off[0]) / determinant
             x, y = x + step_x, y + step_y
-            if not (x - there[n, 0]) ** 2 + (y - there[n, 1]) ** 2 <= limit**2:
+            if not (x - start[n, 0]) ** 2 + (y - start[n, 1]) ** 2 <= limit**2:
                 correlations[n] = np.nan
                 break
             if step_x**2 + step_y**2 < _STILL_PX**2:
                 break
-        shifts[n, 0], shifts[n, 1] = x - there[n, 0], y - there[n, 1]
+        shifts[n, 0], shifts[n, 1] = x - start[n, 0], y - start[n, 1]
 
 
 def cut_patches(
@@ -217,10 +217,8 @@ def align_patches(
     """
     shifts, correlations = np.empty_like(there_px), np.empty(len(there_px))
     start = np.ascontiguousarray(there_px - OPENCV_PIXEL_OFFSET)
-    _align(
-        *(patches, picture, start, np.ascontiguousarray(warps), np.ascontiguousarray(bends_px)),
-        *(options.limit_px, options.iterations, shifts, correlations),
-    )
+    warps, bends_px = np.ascontiguousarray(warps), np.ascontiguousarray(bends_px)
+    _align(patches, picture, start, warps, bends_px, options.limit_px, options.iterations, shifts, correlations)
     return there_px + shifts, correlations
 
 
@@ -320,30 +318,30 @@ class _Scene(NamedTuple):
         places = self.views.to_world(image, rays * np.where(known[:, None], depths, 1.0)[..., None])
         return _Facets(image, points, levels, places).some(known)
 
-    def visible(self, there: int, places: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "k"]:
+    def visible(self, image: int, places: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "k"]:
         """Whether the surface occludes no place from an image."""
         if self.surface is None:
             return np.ones(len(places), bool)
-        centre = np.broadcast_to(self.views.centre(there), places.shape)
+        centre = np.broadcast_to(self.views.centre(image), places.shape)
         return np.asarray(self.surface.cast(centre, places - centre).distances > 1 - _HIDDEN)
 
     def follow(
-        self, facets: _Facets, pictures: Mapping[int, Float32[np.ndarray, "h w"]], there: int
+        self, facets: _Facets, pictures: Mapping[int, Float32[np.ndarray, "h w"]], image: int
     ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
         """Of the points of one image those found in another: points, images, pixels."""
-        views, camera, options, middles = self.views, self.views.cameras[there], self.options, facets.middles
-        turn = np.sum(views.directions(facets.image, middles) * views.directions(there, middles), axis=1)
-        expected = camera.project(views.to_camera(there, middles))
+        views, camera, options, middles = self.views, self.views.cameras[image], self.options, facets.middles
+        turn = np.sum(views.directions(facets.image, middles) * views.directions(image, middles), axis=1)
+        expected = camera.project(views.to_camera(image, middles))
         seen = camera.contains(expected, 2.0 * options.radius_px) & (turn > np.cos(np.deg2rad(options.turn_deg)))
-        seen[seen] = self.visible(there, middles[seen])
+        seen[seen] = self.visible(image, middles[seen])
         facets, expected = facets.some(seen), expected[seen]
-        offsets = camera.project(views.to_camera(there, facets.places)) - expected[:, None]
+        offsets = camera.project(views.to_camera(image, facets.places)) - expected[:, None]
         warps, bends = _residual_offsets(offsets, options.radius_px)
-        pixels, correlation = align_patches(facets.levels, pictures[there], expected, warps, options, bends)
+        pixels, correlation = align_patches(facets.levels, pictures[image], expected, warps, options, bends)
         good = correlation > options.correlation
-        return facets.points[good], np.full(int(good.sum()), there), pixels[good]
+        return facets.points[good], np.full(int(good.sum()), image), pixels[good]
 
-    def followed_from(
+    def follow_from(
         self, pictures: Mapping[int, Float32[np.ndarray, "h w"]], start: tuple[int, Int[np.ndarray, "k"]]
     ) -> list[tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"], Float[np.ndarray, "_ 2"]]]:
         """Of an image some observations, and where their points are found in those near it: points, images, pixels."""
@@ -371,7 +369,7 @@ class _Scene(NamedTuple):
             pictures |= dict(zip(new, read_now, strict=True))
             pictures = {image: pictures[image] for image in near}
             mine = [own[self.image_index[own] == image] for image in block]
-            follow = partial(self.followed_from, pictures)
+            follow = partial(self.follow_from, pictures)
             found += chain.from_iterable(map_in_threads(follow, zip(block, mine, strict=True)))
             progress("patches", block[-1] + 1, count)
         point, image_index, pixels = (np.concatenate(each) for each in zip(*found, strict=True))
@@ -411,7 +409,7 @@ def follow_points(
     views = _Views.of(names, np.arange(len(names)), (model.camera,) * len(names), tuple(model.cam_from_world.values()))
     scene = _Scene(views, tracks, tracks.frame_index, surface, options)
     point, frame, pixels = scene.follow_all(read, progress)
-    return _with_observations(tracks, point, frame, np.zeros_like(frame), pixels)
+    return _replace_observations(tracks, point, frame, np.zeros_like(frame), pixels)
 
 
 def follow_rig_points(
@@ -444,10 +442,10 @@ def follow_rig_points(
 
     scene = _Scene(views, tracks, image_index.reshape(-1), surface, options)
     point, seen_in, pixels = scene.follow_all(image, progress)
-    return _with_observations(tracks, point, frame_of[seen_in], camera_of[seen_in], pixels)
+    return _replace_observations(tracks, point, frame_of[seen_in], camera_of[seen_in], pixels)
 
 
-def _with_observations(
+def _replace_observations(
     tracks: Tracks,
     point: Int[np.ndarray, "m"],
     frame: Int[np.ndarray, "m"],
@@ -456,14 +454,14 @@ def _with_observations(
 ) -> Tracks:
     """The points of tracks with other observations, if they have any."""
     other = replace(tracks, point_index=point, frame_index=frame, camera_index=camera, pixels=pixels)
-    return chosen_tracks(other, np.ones(len(point), bool))
+    return select_tracks(other, np.ones(len(point), bool))
 
 
-def hold_together(tracks: Tracks, frames: int, least: int) -> bool:
+def are_connected(tracks: Tracks, frames: int, least: int) -> bool:
     """Whether at least so many points hold each of the frames, and what lies before it and behind."""
-    held = np.bincount(tracks.frame_index, minlength=frames)
+    observations = np.bincount(tracks.frame_index, minlength=frames)
     across = points_across(tracks.point_index, tracks.frame_index, frames)
-    return bool(min(held.min(), across.min(initial=least)) >= least)
+    return bool(min(observations.min(), across.min(initial=least)) >= least)
 
 
 def lengthen(
@@ -475,4 +473,4 @@ def lengthen(
 ) -> SparseModel:
     """The model of one camera with a second track (:func:`follow_points`) for each point whose patch was found."""
     second = follow_points(model, read, options, progress=progress)
-    return replace(model, tracks=joined_tracks(model.tracks, second))
+    return replace(model, tracks=concatenate_tracks(model.tracks, second))

@@ -41,11 +41,11 @@ def look_alike(features: Sequence[Features], apart: int, seed: int) -> list[tupl
 
 def _vlad(features: Sequence[Features], seed: int) -> Float[np.ndarray, "f d"]:
     """Unit vectors."""
-    words = typical([each.descriptors for each in features], seed)
+    words = visual_words([each.descriptors for each in features], seed)
     return np.stack([look([each.descriptors], words) for each in features])
 
 
-def typical(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: int) -> Float[np.ndarray, "k 128"]:
+def visual_words(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]], seed: int) -> Float[np.ndarray, "k 128"]:
     """A few typical descriptors of images. There must be as many as that."""
     rng = np.random.default_rng(seed)
     every = np.concatenate(list(descriptors))

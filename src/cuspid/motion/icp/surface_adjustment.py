@@ -55,7 +55,7 @@ def _blocks(surface: Surface, pose: Rigid3, distance_mm: float) -> _Blocks:
     return set(map(tuple, blocks.tolist()))
 
 
-def _shared_part(one: _Blocks, other: _Blocks) -> float:
+def _shared_fraction(one: _Blocks, other: _Blocks) -> float:
     """The part of the smaller surface that both share."""
     return len(one & other) / max(min(len(one), len(other)), 1)
 
@@ -63,15 +63,15 @@ def _shared_part(one: _Blocks, other: _Blocks) -> float:
 def neighbours(
     surfaces: Sequence[Surface], poses: Sequence[Rigid3], min_overlap: float, distance_mm: float
 ) -> list[tuple[int, int]]:
-    """Pairs of frames that share more than this part of the smaller surface, told by the blocks of space that it fills,
-    in both orders.
+    """Pairs of frames that share more than this part of the smaller surface, estimated from the blocks of space that it
+    fills, in both orders.
 
     Only relative neighbours (G. Toussaint, Pattern Recognition 12, 1980): a pair is left out if both overlap more with
     a third frame. The farther apart two frames are, the less alike are the errors of their surfaces, and what these do
     to a pose adds up along a path; pairs of one pass and another stay where these come closest.
     """
     blocks = [_blocks(surface, pose, distance_mm) for surface, pose in zip(surfaces, poses, strict=True)]
-    shared = np.array([[_shared_part(one, other) for other in blocks] for one in blocks])
+    shared = np.array([[_shared_fraction(one, other) for other in blocks] for one in blocks])
     np.fill_diagonal(shared, 0.0)
     through_third = np.array([np.minimum(one, shared).max(axis=1) for one in shared])
     found = (shared > min_overlap) & (shared >= through_third)
@@ -89,17 +89,17 @@ def lay_together(
 ) -> tuple[list[Rigid3], float, Expectation | None]:
     """The poses with which some points of each surface lie best on those that it is paired with, their mean scatter,
     mm, and what follows for the surface."""
-    found, laid = list(poses), list[Correspondences | None]()
+    found, matches = list(poses), list[Correspondences | None]()
     for number in range(rounds):
-        laid = map_in_threads(partial(_compare_surfaces, some, surfaces, found, distance_mm), pairs)
-        step = _step(_in_world(pairs, laid, found), len(found))
+        matches = map_in_threads(partial(_compare_surfaces, some, surfaces, found, distance_mm), pairs)
+        step = _step(_pairs_in_world(pairs, matches, found), len(found))
         found = [pose @ small_motion(motion).inverse() for pose, motion in zip(found, step, strict=True)]
         progress("adjustment", number + 1, rounds)
         if np.abs(step[:, 3:]).max() < _CONVERGED * distance_mm:
             break
     progress("adjustment", rounds, rounds)
-    scatter = float(np.mean([each.sigma for each in laid if each is not None] or [0.0]))
-    return found, scatter, _expected_error(some, _in_world(pairs, laid, found), found, distance_mm)
+    scatter = float(np.mean([each.sigma for each in matches if each is not None] or [0.0]))
+    return found, scatter, _expected_error(some, _pairs_in_world(pairs, matches, found), found, distance_mm)
 
 
 def _compare_surfaces(
@@ -118,8 +118,8 @@ _Pair = tuple[int, int, Correspondences]
 """Two frames, and how the surface of the first lies on that of the second, in the world."""
 
 
-def _in_world(
-    pairs: Sequence[tuple[int, int]], laid: Sequence[Correspondences | None], poses: Sequence[Rigid3]
+def _pairs_in_world(
+    pairs: Sequence[tuple[int, int]], matches: Sequence[Correspondences | None], poses: Sequence[Rigid3]
 ) -> list[_Pair]:
     """The pairs that lie on each other."""
     world_from_rig = [pose.inverse() for pose in poses]
@@ -130,7 +130,7 @@ def _in_world(
                 points=world_from_rig[other].apply(each.points), normals=world_from_rig[other].rotate(each.normals)
             ),
         )
-        for (one, other), each in zip(pairs, laid, strict=True)
+        for (one, other), each in zip(pairs, matches, strict=True)
         if each is not None
     ]
 
@@ -167,14 +167,14 @@ def _covariance(pairs: Sequence[_Pair], poses: Sequence[Rigid3], distance_mm: fl
     """
     matrix, _ = _equations(pairs, len(poses))
 
-    def in_space(one: int, laid: Correspondences) -> Float[np.ndarray, "n 3"]:
-        return np.floor(laid.points / (_IN_SPACE * distance_mm))
+    def in_space(one: int, match: Correspondences) -> Float[np.ndarray, "n 3"]:
+        return np.floor(match.points / (_IN_SPACE * distance_mm))
 
-    def in_view(one: int, laid: Correspondences) -> Float[np.ndarray, "n 3"]:
-        return np.floor(poses[one].apply(laid.points) / (_IN_VIEW * distance_mm))
+    def in_view(one: int, match: Correspondences) -> Float[np.ndarray, "n 3"]:
+        return np.floor(poses[one].apply(match.points) / (_IN_VIEW * distance_mm))
 
-    def in_both(one: int, laid: Correspondences) -> Float[np.ndarray, "n 6"]:
-        return np.concatenate([in_space(one, laid), in_view(one, laid)], axis=1)
+    def in_both(one: int, match: Correspondences) -> Float[np.ndarray, "n 6"]:
+        return np.concatenate([in_space(one, match), in_view(one, match)], axis=1)
 
     scatter = (
         _scatter(pairs, in_space, len(poses), len(matrix))

@@ -97,12 +97,12 @@ class _Step:
     """A frame laid onto another one."""
 
     this_from_other: Rigid3
-    laid: Correspondences | None
+    match: Correspondences | None
 
     @property
     def rank(self) -> float:
         """The more overlap and the less scatter, the better."""
-        return 0.0 if self.laid is None else self.laid.share / self.laid.sigma
+        return 0.0 if self.match is None else self.match.share / self.match.sigma
 
 
 # --- one frame onto another --------------------------------------------------------------------------------------
@@ -118,25 +118,25 @@ def _register_icp(
     """Lay a surface onto another one, from a pose nearby."""
     pose = start
     for reach in reaches:
-        laid = match_point_to_plane(one, other, pose, reach, distance_mm)
-        if laid is None:
+        match = match_point_to_plane(one, other, pose, reach, distance_mm)
+        if match is None:
             return _Step(pose, None)
-        pose = small_motion(-solve_damped(*laid.normal_equations(), _DAMPING)) @ pose
+        pose = small_motion(-solve_damped(*match.normal_equations(), _DAMPING)) @ pose
     # A start that was made of other poses is a rotation only up to rounding, which would double from frame to frame.
     pose = Rigid3.from_rotation_vector(pose.rotation_vector, pose.translation)
     return _Step(pose, match_point_to_plane(one, other, pose, reaches[-1], distance_mm))
 
 
-def _doubt(step: _Step, overlap: float, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
+def _rejection_reason(step: _Step, overlap: float, options: SurfaceTrackingOptions, distance_mm: float) -> str | None:
     """Why a frame must not be placed so; None if it may be."""
-    laid = step.laid
-    if laid is None or laid.share < overlap:
-        share = 0.0 if laid is None else laid.share
+    match = step.match
+    if match is None or match.share < overlap:
+        share = 0.0 if match is None else match.share
         return f"only {share:.0%} of its surface lies on that of an earlier frame"
-    if laid.sigma > laid.share * options.max_scatter * distance_mm:
-        return f"its surface scatters about that of earlier frames by {1000 * laid.sigma:.0f} um"
-    if laid.relief < options.min_relief:
-        return "its surface is too flat to be held in place by its shape"
+    if match.sigma > match.share * options.max_scatter * distance_mm:
+        return f"its surface scatters about that of earlier frames by {1000 * match.sigma:.0f} um"
+    if match.relief < options.min_relief:
+        return "its surface is too flat to determine its pose"
     return None
 
 
@@ -167,7 +167,7 @@ def _track_frame(
     for number, earlier in enumerate(list(placed)[: -_BRIEFLY - 1 : -1]):
         starts = _starts(motion, distance_mm)
         step = _register_from_starts(surfaces, earlier, frame, starts, options, distance_mm)
-        doubt = _doubt(step, options.min_overlap, options, distance_mm)
+        doubt = _rejection_reason(step, options.min_overlap, options, distance_mm)
         if doubt is None:
             return step.this_from_other @ placed[earlier], ""
         reason = doubt if number == 0 else reason
@@ -241,7 +241,7 @@ def _join_pieces(
     number = 0
     while number < len(left):
         progress("lost pieces", len(pieces) - len(left) + number, len(pieces))
-        found = _found_on(surfaces, placed, left[number], options, distance_mm)
+        found = _relocate_piece(surfaces, placed, left[number], options, distance_mm)
         if found:
             placed |= found
             del left[number]
@@ -251,7 +251,7 @@ def _join_pieces(
     return placed
 
 
-def _found_on(
+def _relocate_piece(
     surfaces: Sequence[Surface],
     placed: Mapping[int, Rigid3],
     piece: Mapping[int, Rigid3],
@@ -264,22 +264,22 @@ def _found_on(
     for frame, pose in piece.items():
         for earlier in sorted(placed, key=lambda each: abs(each - frame)):
             tried = _register_icp(few[earlier], surfaces[frame], Rigid3.identity(), distance_mm)
-            if _doubt(tried, options.min_overlap, options, distance_mm) is not None:
+            if _rejection_reason(tried, options.min_overlap, options, distance_mm) is not None:
                 continue
             step = _register_from_starts(surfaces, earlier, frame, [tried.this_from_other], options, distance_mm)
-            if _doubt(step, overlap, options, distance_mm) is not None:
+            if _rejection_reason(step, overlap, options, distance_mm) is not None:
                 continue
             found = pose.inverse() @ step.this_from_other @ placed[earlier]
-            there = {each: its @ found for each, its in piece.items()}
-            if _is_borne_out(surfaces, placed, there, overlap, options, distance_mm):
-                return there
+            moved = {each: its @ found for each, its in piece.items()}
+            if _verify_with_neighbours(surfaces, placed, moved, overlap, options, distance_mm):
+                return moved
     return {}
 
 
-def _is_borne_out(
+def _verify_with_neighbours(
     surfaces: Sequence[Surface],
     placed: Mapping[int, Rigid3],
-    there: Mapping[int, Rigid3],
+    moved: Mapping[int, Rigid3],
     overlap: float,
     options: SurfaceTrackingOptions,
     distance_mm: float,
@@ -287,14 +287,14 @@ def _is_borne_out(
     """Whether frames that would look at the same place, if they were there, see the same: one that lies on another by
     chance has neighbours that do not."""
     near = [
-        pair for pair in product(placed, there) if _is_near(there[pair[1]] @ placed[pair[0]].inverse(), distance_mm)
+        pair for pair in product(placed, moved) if _is_near(moved[pair[1]] @ placed[pair[0]].inverse(), distance_mm)
     ]
     witnesses = near[:: max(len(near) // _WITNESSES, 1)]
     steps = (
-        _register_icp(surfaces[a], surfaces[b], there[b] @ placed[a].inverse(), distance_mm, _REACHES[-_LAST_STEPS:])
+        _register_icp(surfaces[a], surfaces[b], moved[b] @ placed[a].inverse(), distance_mm, _REACHES[-_LAST_STEPS:])
         for a, b in witnesses
     )
-    agree = [_doubt(step, overlap, options, distance_mm) is None for step in steps]
+    agree = [_rejection_reason(step, overlap, options, distance_mm) is None for step in steps]
     return len(agree) >= _LEAST_WITNESSES and sum(agree) >= _AGREED * len(agree)
 
 
@@ -327,7 +327,7 @@ def track_surfaces(
     progress: Progress = silent,
 ) -> Reconstruction:
     """Metric poses of the frames of a capture, from their depth maps, which come frame by frame in the order of
-    capture. The calibration is held.
+    capture. The calibration is fixed.
 
     Raises ReconstructionError where too few frames can be placed.
     """
@@ -386,7 +386,7 @@ def glare_notes(handpiece: Handpiece) -> tuple[str, ...]:
     if handpiece.lights and all(light.glare <= _LITTLE_GLARE for light in handpiece.lights.values()):
         return ()
     return (
-        "depth: as far as the handpiece file tells (glare of each light), there are no crossed polarisers: in "
+        "depth: according to the handpiece file (glare of each light), there are no crossed polarisers: in "
         "simulation, mirror reflections of wet teeth hide from a sixth (six coloured lights in turn) to half of the "
         "surface (white lights, and 0.03 mm of error); use polarisers or powder",
     )
@@ -409,7 +409,7 @@ def _require_enough(
     if placed >= options.min_located * total and (placed > 1 or total == 1):
         return
     shown = "; ".join(f"{each.what}: {each.reason}" for each in dropped[:3])
-    polarisers = "cross polarisers (the handpiece file tells of none), " if glare_notes(handpiece) else ""
+    polarisers = "cross polarisers (the handpiece file states none), " if glare_notes(handpiece) else ""
     raise ReconstructionError(
         f"motion: only {placed} of {total} frames could be placed by their surfaces ({shown}); {polarisers}take frames "
         "closer together, see that the lights are on and nothing else shines, or give the surface texture (powder)"

@@ -1,8 +1,8 @@
 """What frames show of a surface, and how one surface lies on another: by the distances along the normals between points
 and their nearest (Y. Chen, G. Medioni, Image and Vision Computing 10, 1992).
 
-A point counts for as much as its depth is known: what is smooth because the images tell little there goes along with
-the cameras, and would hold them back.
+A point counts for as much as its depth is known: what is smooth for lack of evidence moves along with the cameras, and
+would hold them back.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Correspondences(NamedTuple):
         return np.concatenate([np.cross(self.points, self.normals), self.normals], axis=1)
 
     def normal_equations(self) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
-        """Of that motion: matrix and right side."""
+        """Matrix and right-hand side of the normal equations for that motion."""
         rows = self.rows
         weighted = rows * self.weights[:, None]
         return weighted.T @ rows, weighted.T @ self.distances
@@ -185,7 +185,7 @@ def match_point_to_plane(
 
 
 def small_motion(motion: Float[np.ndarray, "6"]) -> Rigid3:
-    """By a small motion: rotation vector, translation."""
+    """The rigid motion of a small step (rotation vector, translation)."""
     return Rigid3.from_rotation_vector(motion[:3], motion[3:])
 
 

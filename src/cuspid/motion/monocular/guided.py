@@ -76,7 +76,7 @@ def refine(
     free and changes. Raises ReconstructionError where too little is consistent.
     """
     model = _normalize_scale(model)
-    pairs = list(dict.fromkeys([*_successive(len(features), options.steps), *again]))
+    pairs = list(dict.fromkeys([*_pairs_by_step(len(features), options.steps), *again]))
     for number, (tolerance_px, share) in enumerate(zip(options.tolerances_px, options.depth_shares, strict=True)):
         views = [index_features(each, model.camera) for each in features]
         matching = replace(options.matching, tolerance_px=tolerance_px)
@@ -88,7 +88,7 @@ def refine(
     return model
 
 
-def _successive(count: int, steps: Sequence[int]) -> list[tuple[int, int]]:
+def _pairs_by_step(count: int, steps: Sequence[int]) -> list[tuple[int, int]]:
     return [(i, i + step) for step in steps for i in range(count - step)]
 
 

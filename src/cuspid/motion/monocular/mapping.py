@@ -28,7 +28,7 @@ from cuspid.runtime.progress import Progress
 from cuspid.storage.handpieces import camera_from_colmap
 
 LEAST_PHOTOGRAPHS = 3
-"""Two tell no more than a direction from each other."""
+"""Two determine no more than their relative direction."""
 _GUESSED_FOCAL = 1.2
 """Of the longer side: COLMAP's guess, an angle of view of 45 degrees."""
 _STILL_PX, _STILL_SHARE = 0.002, 0.6
@@ -91,7 +91,7 @@ def fill_database(
 
 
 def guess_camera(known: PhotoCamera, camera_id: int, focal_share: float | None = None) -> pycolmap.Camera:
-    """The calibrated camera, or one of the focal length that EXIF tells, or is guessed as a share of the longer
+    """The calibrated camera, or one of the focal length that EXIF states, or is guessed as a share of the longer
     side."""
     if known.calibrated is not None:
         camera = colmap_camera(known.calibrated, camera_id)
@@ -110,8 +110,8 @@ def guess_camera(known: PhotoCamera, camera_id: int, focal_share: float | None =
 
 
 def guess_focal_lengths(database: Path, photographs: Photographs, shares: Mapping[int, float]) -> None:
-    """Start from other guesses of the focal lengths that neither a calibration nor EXIF tells, by number of the camera,
-    or by 0 for any, as shares of the longer side."""
+    """Start from other guesses of the focal lengths that neither a calibration nor EXIF states, by number of the
+    camera, or by 0 for any, as shares of the longer side."""
     with pycolmap.Database.open(database) as opened:
         for number, known in enumerate(photographs.cameras.values(), start=1):
             opened.update_camera(guess_camera(known, number, shares.get(number, shares.get(0))))
@@ -174,11 +174,11 @@ def verify_matches(
     """Matches of two frames of one camera that agree with one motion, or None where there are too few."""
     if len(matches) < min_matches:
         return None
-    how = pycolmap.TwoViewGeometryOptions(min_num_inliers=min_matches)
-    how.ransac.max_error, how.ransac.random_seed = error_px, seed
-    how.ransac.min_num_trials, how.ransac.max_num_trials = 30, 300
+    options = pycolmap.TwoViewGeometryOptions(min_num_inliers=min_matches)
+    options.ransac.max_error, options.ransac.random_seed = error_px, seed
+    options.ransac.min_num_trials, options.ransac.max_num_trials = 30, 300
     found = pycolmap.estimate_calibrated_two_view_geometry(
-        camera, one.pixels, camera, other.pixels, matches.astype(np.uint32), how
+        camera, one.pixels, camera, other.pixels, matches.astype(np.uint32), options
     )
     return found if len(found.inlier_matches) >= max(min_matches, min_share * len(matches)) else None
 
@@ -187,7 +187,7 @@ def verify_matches(
 
 
 def _run_mapper(
-    database: Path, folder: Path, count: int, how: pycolmap.IncrementalPipelineOptions, progress: Progress
+    database: Path, folder: Path, count: int, options: pycolmap.IncrementalPipelineOptions, progress: Progress
 ) -> list[ColmapModel]:
     placed = 0
 
@@ -196,7 +196,7 @@ def _run_mapper(
         placed = min(placed + 1, count)
         progress("mapping", placed, count)
 
-    models = pycolmap.incremental_mapping(database, folder, folder, how, next_image_callback=tell)
+    models = pycolmap.incremental_mapping(database, folder, folder, options, next_image_callback=tell)
     progress("mapping", count, count)
     return list(models.values())
 
@@ -211,18 +211,18 @@ def map_photographs(
     loose: bool,
     progress: Progress,
 ) -> list[ColmapModel]:
-    """Models of ``count`` photographs, largest first; calibrated cameras are held. ``loose``: from fewer matches."""
-    how = pycolmap.IncrementalPipelineOptions(
+    """Models of ``count`` photographs, largest first; calibrated cameras stay fixed. ``loose``: from fewer matches."""
+    mapper_options = pycolmap.IncrementalPipelineOptions(
         random_seed=seed, num_threads=1, extract_colors=False, min_model_size=LEAST_PHOTOGRAPHS
     )
-    how.min_num_matches = min_matches
-    how.constant_cameras = calibrated_cameras(photographs)
-    how.mapper.constant_cameras = how.constant_cameras
+    mapper_options.min_num_matches = min_matches
+    mapper_options.constant_cameras = calibrated_cameras(photographs)
+    mapper_options.mapper.constant_cameras = mapper_options.constant_cameras
     if loose or len(photographs.names) < 2 * LEAST_PHOTOGRAPHS:
-        how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 40, 6.0
-        how.mapper.abs_pose_min_num_inliers, how.mapper.abs_pose_min_inlier_ratio = 15, 0.15
+        mapper_options.mapper.init_min_num_inliers, mapper_options.mapper.init_min_tri_angle = 40, 6.0
+        mapper_options.mapper.abs_pose_min_num_inliers, mapper_options.mapper.abs_pose_min_inlier_ratio = 15, 0.15
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
-        models = _run_mapper(database, Path(folder), count, how, progress)
+        models = _run_mapper(database, Path(folder), count, mapper_options, progress)
     return sorted(models, key=model_size, reverse=True)
 
 
@@ -237,7 +237,7 @@ def model_size(model: ColmapModel) -> tuple[int, int]:
     return int(model.num_reg_images()), int(model.compute_num_observations())
 
 
-def placed_images(model: ColmapModel) -> list[int]:
+def located_images(model: ColmapModel) -> list[int]:
     """Numbers of the photographs, from 0, that a model places."""
     return [int(identifier) - 1 for identifier in model.reg_image_ids()]
 
@@ -256,8 +256,8 @@ def triangulate(
 ) -> ColmapModel:
     """Points for given poses, from the matches of a database."""
     posed = _to_colmap(known, order, features)
-    how = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
-    return pycolmap.triangulate_points(posed, database, database.parent, database.parent, True, how)
+    mapper_options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
+    return pycolmap.triangulate_points(posed, database, database.parent, database.parent, True, mapper_options)
 
 
 def _to_colmap(known: PhotoModel, order: Sequence[Photograph], features: Mapping[int, Features]) -> ColmapModel:
@@ -297,8 +297,8 @@ def refine_lens(model: ColmapModel, held: Collection[int]) -> tuple[ColmapModel,
     RMS reprojection error, px.
 
     A parameter more must pay: one that the images do not determine turns with the poses. The principal point stays in
-    the middle: it can hardly be told from a turn of the camera, above all in a ring of photographs. ``held``: numbers
-    of the cameras whose lens is known.
+    the middle: it can hardly be distinguished from a rotation of the camera, above all in a ring of photographs.
+    ``held``: numbers of the cameras whose lens is known.
     """
     rms = _adjust_model(model, held)
     by_camera = dict.fromkeys(model.cameras, 0)
@@ -332,11 +332,11 @@ def _adjust_model(model: ColmapModel, held: Collection[int]) -> float:
         for number in held:
             config.set_constant_cam_intrinsics(number)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        how = pycolmap.BundleAdjustmentOptions(print_summary=False)
-        how.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-        how.ceres.loss_function_scale = _LOSS_PX
-        how.ceres.solver_options.num_threads = 1
-        pycolmap.create_default_bundle_adjuster(how, config, model).solve()
+        options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+        options.ceres.loss_function_scale = _LOSS_PX
+        options.ceres.solver_options.num_threads = 1
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
         model.update_point_3d_errors()
         errors = np.array([point.error for point in model.points3D.values()])
         limit_px = max(_WORST_SIGMAS * float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0, _LEAST_PX)
@@ -371,17 +371,12 @@ def photo_model(
     camera_names = {name: photographs[name].camera for name in names}
     cameras = {name: camera for name, camera in cameras.items() if name in camera_names.values()}
     known = PhotoModel(
-        cameras={name: _keep_calibration(photographs, name, camera) for name, camera in cameras.items()},
+        cameras={name: photographs.cameras[name].calibrated or camera for name, camera in cameras.items()},
         camera_of=camera_names,
         cam_from_world=poses,
         tracks=_tracks(model, [by_name[name] for name in names], list(cameras), camera_names, names, features),
     )
     return from_first(known)
-
-
-def _keep_calibration(photographs: Photographs, name: str, camera: Camera) -> Camera:
-    """A given calibration as it was given, with its covariance."""
-    return photographs.cameras[name].calibrated or camera
 
 
 def _tracks(
@@ -463,15 +458,17 @@ def map_film(
     progress: Progress,
 ) -> list[FilmModel]:
     """Models of the frames of one camera, largest first: short steps over a low relief, few and noisy matches."""
-    how = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False, min_model_size=3)
-    how.ba_refine_focal_length = how.mapper.abs_pose_refine_focal_length = not calibrated
-    how.ba_refine_extra_params = how.mapper.abs_pose_refine_extra_params = False
-    how.mapper.init_min_num_inliers, how.mapper.init_min_tri_angle = 2 * min_matches, 5.0
-    how.mapper.abs_pose_min_num_inliers = min_matches
-    how.mapper.abs_pose_max_error, how.mapper.abs_pose_min_inlier_ratio = 3 * error_px, 0.15
-    how.mapper.filter_max_reproj_error = 1.5 * error_px
-    how.ba_local_max_refinements, how.ba_global_max_refinements = 1, 2
-    how.ba_global_frames_ratio, how.ba_global_points_ratio = 1.3, 1.4
+    options = pycolmap.IncrementalPipelineOptions(
+        random_seed=seed, num_threads=1, extract_colors=False, min_model_size=3
+    )
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not calibrated
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.init_min_num_inliers, options.mapper.init_min_tri_angle = 2 * min_matches, 5.0
+    options.mapper.abs_pose_min_num_inliers = min_matches
+    options.mapper.abs_pose_max_error, options.mapper.abs_pose_min_inlier_ratio = 3 * error_px, 0.15
+    options.mapper.filter_max_reproj_error = 1.5 * error_px
+    options.ba_local_max_refinements, options.ba_global_max_refinements = 1, 2
+    options.ba_global_frames_ratio, options.ba_global_points_ratio = 1.3, 1.4
     with tempfile.TemporaryDirectory() as folder, quiet():
         database = Path(folder) / "database.db"
         with pycolmap.Database.open(database) as opened:
@@ -480,7 +477,7 @@ def map_film(
                 _write_image(opened, index, found, 1)
             for (one, other), geometry in verified.items():
                 opened.write_two_view_geometry(one + 1, other + 1, geometry)
-        models = _run_mapper(database, Path(folder), len(features), how, progress)
+        models = _run_mapper(database, Path(folder), len(features), options, progress)
     return [_read_film(model) for model in sorted(models, key=lambda model: -int(model.num_reg_images()))]
 
 

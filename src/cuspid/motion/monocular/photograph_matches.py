@@ -1,4 +1,4 @@
-"""What photographs have in common: keypoints, the pairs that are worth a match, and matches that one motion explains.
+"""What photographs have in common: keypoints, the candidate pairs, and matches that one motion explains.
 
 Photographs come in any order and turned in any way. Descriptors are therefore not upright, and each photograph is
 matched with all others; of many, with those that look like it (Jégou et al., CVPR 2010, as in
@@ -19,7 +19,7 @@ from jaxtyping import Int, Shaped, UInt8
 from cuspid.model.capture import Dropped
 from cuspid.model.photographs import Photograph
 from cuspid.motion.frontend.features import FeatureOptions, Features, detect
-from cuspid.motion.frontend.revisits import WORDS, look, typical
+from cuspid.motion.frontend.revisits import WORDS, look, visual_words
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.image_files import Pixels, visible_grey
 from cuspid.runtime.progress import Progress
@@ -84,8 +84,10 @@ def _detect(photograph: Photograph, options: FeatureOptions, max_image_px: int, 
     return replace(found, pixels=found.pixels * (size / searched))
 
 
-def _resize(image: Shaped[np.ndarray, "h w *c"], size: Int[np.ndarray, "2"], how: int) -> Shaped[np.ndarray, "a b *c"]:
-    return np.asarray(cv2.resize(image, size.tolist(), interpolation=how))
+def _resize(
+    image: Shaped[np.ndarray, "h w *c"], size: Int[np.ndarray, "2"], interpolation: int
+) -> Shaped[np.ndarray, "a b *c"]:
+    return np.asarray(cv2.resize(image, size.tolist(), interpolation=interpolation))
 
 
 def _equalize_contrast(image: Pixels) -> UInt8[np.ndarray, "h w 3"]:
@@ -100,8 +102,8 @@ def _equalize_contrast(image: Pixels) -> UInt8[np.ndarray, "h w 3"]:
 def candidate_pairs(
     features: Mapping[int, Features], *, is_film: bool, most_exhaustive: int, alike: int, seed: int
 ) -> list[tuple[int, int]]:
-    """Pairs that are worth a match: all of a few photographs; otherwise each with the ``alike`` most alike, and in a
-    film with the next ones."""
+    """Candidate pairs: all of a few photographs; otherwise each with the ``alike`` most alike, and in a film with the
+    next ones."""
     order = sorted(features)
     if len(order) <= (0 if is_film else most_exhaustive):
         return list(combinations(order, 2))
@@ -115,7 +117,7 @@ def _look_alike(features: Sequence[Features], count: int, seed: int) -> set[tupl
     """For each photograph the ``count`` others that look most like it."""
     if sum(map(len, features)) < WORDS:
         return set()
-    words = typical([each.descriptors for each in features], seed)
+    words = visual_words([each.descriptors for each in features], seed)
     codes = np.stack(map_in_threads(lambda each: look([each.descriptors], words), features))
     likeness = codes @ codes.T
     np.fill_diagonal(likeness, -np.inf)

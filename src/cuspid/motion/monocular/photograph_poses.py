@@ -1,4 +1,4 @@
-"""Poses of photographs from a COLMAP model that somebody else made; where it has no points, they are found anew.
+"""Poses of photographs from a COLMAP model that somebody else made; where it has no points, they are triangulated.
 
 Photographs are known by the stem of their name, whatever its case, suffix and folder. The model may be of larger or
 smaller photographs of the same shape.
@@ -22,7 +22,7 @@ from cuspid.model.sparse_model import PhotoModel
 from cuspid.motion.colmap import ColmapModel, quiet, read_sparse, rigid_from_colmap
 from cuspid.motion.monocular.mapping import adjusted_rms, camera_of, from_first, photo_model, triangulate
 from cuspid.motion.monocular.photograph_matches import detect_in_all
-from cuspid.motion.monocular.photographs import PhotographOptions, check_enough, in_own_order, match_all
+from cuspid.motion.monocular.photographs import PhotographOptions, canonical_order, check_enough, match_all
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.progress import Progress, silent
 
@@ -42,10 +42,10 @@ def take_photograph_poses(
     check_enough(photographs)
     with quiet():
         model = read_sparse(folder)
-        images = _by_name(model, photographs, folder)
+        images = _images_by_name(model, photographs, folder)
         known = _take_model(model, images, photographs, folder)
         if len(known.tracks.points) < _LEAST_POINTS:
-            known = _with_points(known, photographs, options, progress)
+            known = _triangulate(known, photographs, options, progress)
     missing = [
         Dropped(what=f"photograph {name}", reason=f"not in {folder}")
         for name in photographs.names
@@ -59,7 +59,7 @@ def take_photograph_poses(
     )
 
 
-def _by_name(model: ColmapModel, photographs: Photographs, folder: Path) -> dict[str, pycolmap.Image]:
+def _images_by_name(model: ColmapModel, photographs: Photographs, folder: Path) -> dict[str, pycolmap.Image]:
     """The images of the model that are among the photographs. Raises InputError where none is."""
     names = {name.lower(): name for name in photographs.names}
     found = {}
@@ -84,7 +84,9 @@ def _take_model(
     keys = {name: (photographs[name].camera, image.camera_id) for name, image in images.items()}
     several = len(set(keys.values())) > len({camera for camera, _ in keys.values()})
     label = {key: f"{key[0]}-{key[1]}" if several else key[0] for key in keys.values()}
-    cameras = {label[key]: _to_size(model.cameras[key[1]], photographs, name, folder) for name, key in keys.items()}
+    cameras = {
+        label[key]: _camera_of_size(model.cameras[key[1]], photographs, name, folder) for name, key in keys.items()
+    }
     camera_names = {name: label[key] for name, key in keys.items()}
     known = PhotoModel(
         cameras=cameras,
@@ -95,7 +97,7 @@ def _take_model(
     return from_first(known)
 
 
-def _to_size(camera: pycolmap.Camera, photographs: Photographs, name: str, folder: Path) -> Camera:
+def _camera_of_size(camera: pycolmap.Camera, photographs: Photographs, name: str, folder: Path) -> Camera:
     """A camera of the model for the size of a photograph. Raises InputError where that has another shape."""
     known = camera_of(camera, f"{folder}: camera {camera.camera_id}")
     width, height = photographs[name].size
@@ -146,7 +148,7 @@ def _tracks(
 # --- points for poses that have none -----------------------------------------------------------------------------
 
 
-def _with_points(
+def _triangulate(
     known: PhotoModel, photographs: Photographs, options: PhotographOptions, progress: Progress
 ) -> PhotoModel:
     """The same poses, with points that the photographs show."""
@@ -158,7 +160,7 @@ def _with_points(
             for name, camera in known.cameras.items()
         },
     )
-    order = in_own_order(own)
+    order = canonical_order(own)
     features, _ = detect_in_all(
         order, options.features, max_image_px=options.max_image_px, even=False, progress=progress
     )

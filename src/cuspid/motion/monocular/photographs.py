@@ -29,11 +29,11 @@ from cuspid.motion.monocular.mapping import (
     fill_database,
     focal_shares,
     guess_focal_lengths,
+    located_images,
     map_photographs,
     match_pairs,
     model_size,
     photo_model,
-    placed_images,
     read_verified_pairs,
     refine_lens,
 )
@@ -89,7 +89,7 @@ def locate_photographs(
     """
     options = options or PhotographOptions()
     check_enough(photographs)
-    order = in_own_order(photographs)
+    order = canonical_order(photographs)
     best: _Attempt | None = None
     with tempfile.TemporaryDirectory() as folder, quiet():
         for plain in (False, True):
@@ -100,7 +100,7 @@ def locate_photographs(
                 break
         assert best is not None
         if not best.models:
-            raise ReconstructionError(_why_nothing(photographs, order, best))
+            raise ReconstructionError(_explain_failure(photographs, order, best))
         return _to_sparse_model(photographs, order, best)
 
 
@@ -114,7 +114,7 @@ def check_enough(photographs: Photographs) -> None:
         )
 
 
-def in_own_order(photographs: Photographs) -> tuple[Photograph, ...]:
+def canonical_order(photographs: Photographs) -> tuple[Photograph, ...]:
     """A film as it was taken, other photographs by their contents, whatever their names."""
     if photographs.is_film:
         return photographs.photographs
@@ -138,7 +138,7 @@ class _Attempt:
     @property
     def located_count(self) -> int:
         """Number of photographs in the largest model."""
-        return len(placed_images(self.models[0])) if self.models else 0
+        return len(located_images(self.models[0])) if self.models else 0
 
 
 def _attempt(
@@ -151,8 +151,8 @@ def _attempt(
     progress: Progress,
 ) -> _Attempt:
     started = time.perf_counter()
-    how = options.plain_features if plain else options.features
-    features, unread = detect_in_all(order, how, max_image_px=options.max_image_px, even=plain, progress=progress)
+    keypoints = options.plain_features if plain else options.features
+    features, unread = detect_in_all(order, keypoints, max_image_px=options.max_image_px, even=plain, progress=progress)
     detected = time.perf_counter()
     database = folder / f"{'plain' if plain else 'first'}.db"
     pairs = match_all(photographs, order, features, database, options, plain=plain, progress=progress)
@@ -205,7 +205,7 @@ def _models(
 ) -> list[ColmapModel]:
     """COLMAP's models, largest first. Where the first does not locate all, once more with fewer matches, from the focal
     length that it found, or from other guesses where it found none."""
-    if not pairs or stood_still(pairs):
+    if not pairs or is_static(pairs):
         return []
     attempt = partial(
         map_photographs,
@@ -218,16 +218,16 @@ def _models(
     )
     models = attempt(loose=plain)
     found = focal_shares(models)
-    told = all(each.calibrated is not None or each.focal_px is not None for each in photographs.cameras.values())
-    for focal_share in (found,) if found or told else _OTHER_FOCALS:
-        if models and len(placed_images(models[0])) == count:
+    focal_known = all(each.calibrated is not None or each.focal_px is not None for each in photographs.cameras.values())
+    for focal_share in (found,) if found or focal_known else _OTHER_FOCALS:
+        if models and len(located_images(models[0])) == count:
             break
         guess_focal_lengths(database, photographs, focal_share)
         models = max(models, attempt(loose=True), key=lambda each: model_size(each[0]) if each else (0, 0))
     return models
 
 
-def stood_still(pairs: Sequence[Pair]) -> bool:
+def is_static(pairs: Sequence[Pair]) -> bool:
     """Whether most pairs show the same at the same place."""
     return bool(pairs) and sum(pair.is_still for pair in pairs) > _STILL_PAIRS * len(pairs)
 
@@ -255,7 +255,7 @@ def _to_sparse_model(photographs: Photographs, order: Sequence[Photograph], foun
 
 def _unlocated_reasons(order: Sequence[Photograph], found: _Attempt) -> list[Dropped]:
     """The photographs that are not in the largest model, and why not."""
-    placed, *others = (set(placed_images(model)) for model in found.models)
+    placed, *others = (set(located_images(model)) for model in found.models)
     dropped = []
     for index in sorted(set(found.features) - placed, key=lambda each: order[each].name):
         partners = sum(index in (pair.first, pair.second) for pair in found.pairs)
@@ -272,7 +272,7 @@ def _unlocated_reasons(order: Sequence[Photograph], found: _Attempt) -> list[Dro
 
 def _notes(photographs: Photographs, model: PhotoModel, found: _Attempt) -> list[str]:
     notes = []
-    placed, *others = (set(placed_images(each)) for each in found.models)
+    placed, *others = (set(located_images(each)) for each in found.models)
     apart = [len(other) for other in others if not other <= placed]
     if apart:
         notes.append(
@@ -282,9 +282,11 @@ def _notes(photographs: Photographs, model: PhotoModel, found: _Attempt) -> list
     for name, camera in model.cameras.items():
         known = photographs.cameras[name]
         if known.calibrated is None:
-            told = "EXIF and the photographs" if known.focal_px is not None else "the photographs"
+            sources = "EXIF and the photographs" if known.focal_px is not None else "the photographs"
             lens = ", ".join(f"{value:.4f}" for value in camera.distortion)
-            notes.append(f"{name}: focal length {camera.focal_px[0]:.0f} px and distortion ({lens}) found from {told}")
+            notes.append(
+                f"{name}: focal length {camera.focal_px[0]:.0f} px and distortion ({lens}) found from {sources}"
+            )
     angle = float(np.median(_widest_angles_deg(model)))
     if angle < _NARROW_DEG:
         notes.append(
@@ -307,12 +309,12 @@ def _widest_angles_deg(model: PhotoModel) -> Float[np.ndarray, "p"]:
     return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def _why_nothing(photographs: Photographs, order: Sequence[Photograph], found: _Attempt) -> str:
+def _explain_failure(photographs: Photographs, order: Sequence[Photograph], found: _Attempt) -> str:
     """What to tell a user whose photographs could not be located."""
     source, counts = photographs.source, [len(each) for each in found.features.values()]
     if not counts:
         return f"{source}: none of {len(order)} photographs can be read; the first: {found.unread[0].reason}"
-    if stood_still(found.pairs):
+    if is_static(found.pairs):
         return still_message(photographs, found.pairs)
     if np.median(counts) < 50:
         return (
@@ -331,7 +333,7 @@ def _why_nothing(photographs: Photographs, order: Sequence[Photograph], found: _
 
 
 def still_message(photographs: Photographs, pairs: Sequence[Pair]) -> str:
-    """What to tell a user whose camera stood still before a background."""
+    """The message for a user whose camera stood still before a background."""
     still = sum(pair.is_still for pair in pairs)
     return (
         f"{photographs.source}: in {still} of {len(pairs)} pairs of photographs nothing moves: it is the background "

@@ -36,7 +36,7 @@ _LEAST_MM, _READING_MM = 0.01, 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoScaleOptions(BoardPattern):
-    """What tells how large things are that one camera has photographed: a board, or measured distances."""
+    """What sets the scale of the photographs of one camera: a board, or measured distances."""
 
     square_mm: Annotated[float | None, Range(0.001, 10_000)] = None
     """Side of a square of a board that some photographs show, as measured on the print: it sets the scale."""
@@ -176,7 +176,7 @@ def scale_by_board(model: PhotoModel, sightings: Sequence[BoardSighting], board:
             f"{what} is seen in {len(sightings)} of {photographs} photographs, but {len(located)} of these could be "
             "located; it takes two, from different places"
         )
-    numbered = _in_one_numbering(model, located, board)
+    numbered = _unify_numbering(model, located, board)
     corner, points = _corners(model, numbered)
     if len(corner) < _LEAST_CORNERS:
         raise ReconstructionError(
@@ -216,7 +216,7 @@ def _corners(
     return np.array(list(found), dtype=np.int64), np.array(list(found.values())).reshape(-1, 3)
 
 
-def _in_one_numbering(model: PhotoModel, sightings: Sequence[BoardSighting], board: Board) -> list[BoardSighting]:
+def _unify_numbering(model: PhotoModel, sightings: Sequence[BoardSighting], board: Board) -> list[BoardSighting]:
     """Sightings of a chessboard, whose corners are not told apart, numbered as in the first one."""
     orders = board.orders
     if len(orders) == 1:
@@ -298,11 +298,11 @@ def scale_by_distances(model: PhotoModel, distances: Sequence[PickedDistance]) -
     left = factor * lengths - measured
     rms_mm = float(np.sqrt(np.mean(left**2)))
     sigma_mm = max(_READING_MM, rms_mm)
-    told = " and ".join(f"{each:g} mm" for each in measured)
+    given = " and ".join(f"{each:g} mm" for each in measured)
     return Scale(
         mm_per_unit=factor,
         sigma_share=sigma_mm / float(np.linalg.norm(measured)),
-        told_by=f"{told} between picked places",
+        told_by=f"{given} between picked places",
         residual_mm=rms_mm,
     )
 

@@ -20,12 +20,12 @@ from cuspid.model.camera import Camera
 from cuspid.model.image_sequence import ImageSequence
 from cuspid.model.mesh import Mesh
 from cuspid.model.panorama import FrameUse
-from cuspid.model.reconstruction import Tracks, chosen_tracks, joined_tracks
+from cuspid.model.reconstruction import Tracks, concatenate_tracks, select_tracks
 from cuspid.model.sparse_model import SparseModel
 from cuspid.motion.bundle.adjustment import adjust_model
 from cuspid.motion.frontend.features import FeatureOptions, Features, detect
 from cuspid.motion.frontend.pairs import MatchingOptions, match_unguided
-from cuspid.motion.frontend.patches import PatchOptions, follow_points, hold_together, lengthen
+from cuspid.motion.frontend.patches import PatchOptions, are_connected, follow_points, lengthen
 from cuspid.motion.frontend.revisits import look_alike
 from cuspid.motion.frontend.tracks import first_and_last
 from cuspid.motion.monocular.guided import GuidedOptions, refine
@@ -392,7 +392,7 @@ def locate_single(
         wider = _map(camera, features, verified, sequence, options, progress)
         models = max(models, wider, key=lambda each: len(each[0].poses) if each else 0)
     if not models:
-        raise ReconstructionError(_why_nothing(sequence, kept, features, verified))
+        raise ReconstructionError(_explain_failure(sequence, kept, features, verified))
     parts = _join_all(models, options.min_matches)
     first = _start_camera(models[0].focal_px, sequence, options)
     refined = [_refine_part(part, first, sequence, features, list(again), options, progress) for part in parts]
@@ -400,8 +400,8 @@ def locate_single(
         parts=tuple(refined),
         frames=_uses(names, refused, refined, verified),
         notes=(
-            *_strangers(looks, names),
-            *_seen_again(list(again), names),
+            *_content_notes(looks, names),
+            *_revisit_notes(list(again), names),
             *_notes(refined[0].camera, sequence.camera is not None, refined),
         ),
     )
@@ -448,33 +448,35 @@ def refine_on_surface(
         return normalise_contrast(sequence.fine_image(number[name]), options)
 
     followed = follow_points(part, read, options.patches, surface=surface, progress=progress)
-    if not hold_together(followed, len(part.frames), options.min_matches):
+    if not are_connected(followed, len(part.frames), options.min_matches):
         return None
-    tracks = joined_tracks(_spanning(part.tracks, options.patches.reach), followed)
+    tracks = concatenate_tracks(_long_tracks(part.tracks, options.patches.reach), followed)
     try:
         return adjust_model(replace(part, tracks=tracks), options.guided.adjustment)
     except ReconstructionError:
         return None
 
 
-def _spanning(tracks: Tracks, reach: int) -> Tracks:
+def _long_tracks(tracks: Tracks, reach: int) -> Tracks:
     """Those that hold frames together which are farther apart than patches reach: where the camera came back."""
     first, last = first_and_last(tracks.point_index, tracks.frame_index, len(tracks.points))
-    return chosen_tracks(tracks, (last - first > 2 * reach)[tracks.point_index])
+    return select_tracks(tracks, (last - first > 2 * reach)[tracks.point_index])
 
 
-def with_observations(frames: Sequence[FrameUse], part: SparseModel) -> tuple[FrameUse, ...]:
+def count_observations(frames: Sequence[FrameUse], part: SparseModel) -> tuple[FrameUse, ...]:
     """Frames, each with the number of observations that hold it in a part."""
     counts = np.bincount(part.tracks.frame_index, minlength=len(part.frames)).tolist()
-    held = dict(zip(part.frames, counts, strict=True))
-    return tuple(replace(frame, inliers=held[frame.name]) if frame.name in held else frame for frame in frames)
+    observations = dict(zip(part.frames, counts, strict=True))
+    return tuple(
+        replace(frame, inliers=observations[frame.name]) if frame.name in observations else frame for frame in frames
+    )
 
 
-def loosely_held(frames: Sequence[FrameUse]) -> tuple[tuple[FrameUse, ...], ...]:
-    """Stretches of the trajectory that are held by less than half of the observations that its frames have in the
-    median, the weakest first; its ends do not count, for nothing hangs on them. None where observations are not known.
+def weak_stretches(frames: Sequence[FrameUse]) -> tuple[tuple[FrameUse, ...], ...]:
+    """Stretches of the trajectory with less than half of the median number of observations per frame, the weakest
+    first; its ends do not count, for nothing hangs on them. None where observations are not known.
 
-    There a path of one way bends two to four times as often as elsewhere; of one there and back it tells little
+    There a path of one way bends two to four times as often as elsewhere; for one there and back it says little
     (docs/panorama-evaluation.md).
     """
     used = [frame for frame in frames if frame.used]
@@ -488,21 +490,22 @@ def loosely_held(frames: Sequence[FrameUse]) -> tuple[tuple[FrameUse, ...], ...]
     return tuple(tuple(used[stretch[0] : stretch[-1] + 1]) for stretch in found)
 
 
-def loose_notes(frames: Sequence[FrameUse]) -> tuple[str, ...]:
-    """A note where the trajectory is held loosely."""
-    stretches = loosely_held(frames)
+def weak_stretch_notes(frames: Sequence[FrameUse]) -> tuple[str, ...]:
+    """A note where the trajectory is weakly constrained."""
+    stretches = weak_stretches(frames)
     if not stretches:
         return ()
     usual = np.median([frame.inliers for frame in frames if frame.used and frame.inliers is not None])
-    told = [_stretch(stretch) for stretch in stretches[:_MOST_TOLD]]
-    more = f", and at {len(stretches) - len(told)} other places" if len(stretches) > len(told) else ""
+    described = [_describe_stretch(stretch) for stretch in stretches[:_MOST_TOLD]]
+    more = f", and at {len(stretches) - len(described)} other places" if len(stretches) > len(described) else ""
     return (
-        f"the path is held loosely at {', '.join(told)}{more}, where {usual:.0f} are usual: it may bend there "
+        f"the path is weakly constrained at {', '.join(described)}{more}, where {usual:.0f} are usual: it may bend "
+        f"there "
         "(camera_path.png); film there again, more slowly",
     )
 
 
-def _stretch(frames: Sequence[FrameUse]) -> str:
+def _describe_stretch(frames: Sequence[FrameUse]) -> str:
     """``frames 034 to 041 (63 points)``."""
     fewest = min(frame.inliers for frame in frames if frame.inliers is not None)
     first, last = frames[0].name, frames[-1].name
@@ -510,7 +513,7 @@ def _stretch(frames: Sequence[FrameUse]) -> str:
     return f"{named} ({fewest} points)"
 
 
-def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
+def _content_notes(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
     """A note where frames have little of the colours of a mouth."""
     strange = [name for name, look in zip(names, looks, strict=True) if look.mouth_share < 0.5]
     if not strange:
@@ -519,7 +522,7 @@ def _strangers(looks: Sequence[_Look], names: Sequence[str]) -> tuple[str, ...]:
     return (f"{which} have few pixels in the colours of teeth or gums: is this a film of teeth?",)
 
 
-def _seen_again(pairs: Sequence[tuple[int, int]], names: Sequence[str]) -> tuple[str, ...]:
+def _revisit_notes(pairs: Sequence[tuple[int, int]], names: Sequence[str]) -> tuple[str, ...]:
     """A note where the camera came back."""
     if not pairs:
         return ()
@@ -552,7 +555,7 @@ def _check_enough(kept: Sequence[int], refused: Mapping[int, str], names: Sequen
     )
 
 
-def _why_nothing(
+def _explain_failure(
     sequence: ImageSequence,
     kept: Sequence[int],
     features: Mapping[int, Features],
@@ -591,5 +594,5 @@ def _uses(
 
     frames = tuple(use(index, name) for index, name in enumerate(names))
     for part in parts:
-        frames = with_observations(frames, part)
+        frames = count_observations(frames, part)
     return frames

@@ -122,16 +122,16 @@ def _draw_ruler(figure: Figure, board: Board, top_mm: float) -> None:
 
 
 def _describe_board(board: Board) -> str:
-    told = f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm"
+    text = f"{board.kind} {board.columns} x {board.rows} x {board.square_mm:g} mm"
     if board.kind == "charuco":
-        told += f", {board.dictionary}, markers {board.marker_share:g}"
+        text += f", {board.dictionary}, markers {board.marker_share:g}"
     if board.kind == "aprilgrid":
-        told += f", {board.family}, spacing {board.spacing_share:g}"
+        text += f", {board.family}, spacing {board.spacing_share:g}"
     if board.has_circles:
-        told += f", circles of {board.circle_mm:g} mm"
+        text += f", circles of {board.circle_mm:g} mm"
     if board.has_markers:
-        told += f", ids {board.ids_told}"
-    return told + (f"\n{board.terraces} terraces, steps of {board.step_mm:g} mm" if board.terraces > 1 else "")
+        text += f", ids {board.ids_told}"
+    return text + (f"\n{board.terraces} terraces, steps of {board.step_mm:g} mm" if board.terraces > 1 else "")
 
 
 def save_residuals_picture(
@@ -259,7 +259,7 @@ def save_photometry_picture(
     for (name, sensor), colour in zip(sensors.items(), colours, strict=True):
         _draw_falloff(axes[0], name, sensor, colour)
         _draw_noise(axes[2], sensor, *variances[name], colour)
-    _draw_left_over(axes[1], residuals)
+    _draw_residual_shading(axes[1], residuals)
     _label(axes[0], "gain and falloff", "distance from the principal point, half diagonals", "share of the light")
     _label(axes[1], "residuals", "distance from the principal point, half diagonals", "residual, % of the grey value")
     _label(axes[2], "noise", "grey value, DN", "standard deviation, DN")
@@ -280,7 +280,7 @@ def _draw_falloff(axes: Axes, name: str, sensor: Sensor, colour: Float[np.ndarra
         axes.fill_between(r, curve * np.exp(-sigma), curve * np.exp(sigma), color=colour, alpha=0.2, linewidth=0)
 
 
-def _draw_left_over(axes: Axes, residuals: Residuals) -> None:
+def _draw_residual_shading(axes: Axes, residuals: Residuals) -> None:
     """The mean over each ring of each camera, as lines, over all patches, as points."""
     for index, (colour, label) in enumerate(((_BEFORE, "before"), (_AFTER, "after"))):
         r = np.concatenate([each[0] for each in residuals.values()])

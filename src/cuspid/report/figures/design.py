@@ -164,7 +164,7 @@ def draw_scale(panel: Axes) -> None:
 
 
 def colour_of(name: str) -> str:
-    """Of a camera, by the first letter of its name."""
+    """The colour of a camera, by the first letter of its name."""
     return GROUP_COLOURS.get(name[:1], _OTHER)
 
 

@@ -61,7 +61,7 @@ def _draw_plan(axes: Axes, fdi: int, margin: CutMargin, chosen: list[MarginSecti
 
 
 def _draw_section(axes: Axes, number: int, section: MarginSection) -> None:
-    solid = _with_inside(section.reference)
+    solid = _close_section(section.reference)
     axes.fill(*solid.T, color=_SOLID, linewidth=0)
     axes.plot(*section.reference.T, color=_TRUE, linewidth=1.8)
     if section.scan is not None:
@@ -77,7 +77,7 @@ def _draw_section(axes: Axes, number: int, section: MarginSection) -> None:
     axes.set_aspect("equal")
 
 
-def _with_inside(section: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "k 2"]:
+def _close_section(section: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "k 2"]:
     """The polygon of a section and what lies inside of it, beyond the edges of the picture."""
     rightwards = section if section[0, 0] < section[-1, 0] else section[::-1]
     far, deep = 2 * _HALF_MM, 2 * _BELOW_MM

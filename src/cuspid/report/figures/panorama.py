@@ -26,7 +26,7 @@ def save_camera_path(
     """The panorama with the place of the camera at each frame, and below it height and tilt over the frames.
 
     ``cam_from_world`` has the frames by their names; the world is that of the panorama. ``loose``: frames to be marked
-    as held loosely.
+    as weakly constrained.
     """
     poses = [pose.inverse() for pose in cam_from_world.values()]
     centres = np.array([pose.translation for pose in poses])

@@ -250,8 +250,8 @@ def maps(views: Sequence[SpecimenView], *, means: bool) -> Figure | None:
         axes.imshow(_picture(view.mesh, field, options, round(_DPI * side_in)))
         axes.set_axis_off()
         title = name.removeprefix("mean of ") if means else name
-        told = f"{_short(title)}\n{_short(view.name)}" if len(views) > 1 else _short(title)
-        axes.set_title(told, fontsize=7 if means else 5, color=_INK, pad=1.5)
+        label = f"{_short(title)}\n{_short(view.name)}" if len(views) > 1 else _short(title)
+        axes.set_title(label, fontsize=7 if means else 5, color=_INK, pad=1.5)
     _draw_bar(figure, options)
     return figure
 

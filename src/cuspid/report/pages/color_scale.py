@@ -1,4 +1,4 @@
-"""Colour scales: what the colours of a surface tell, from which value to which, and how a legend says it."""
+"""Colour scales: what the colours of a surface mean, their range, and their legend."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _STOPS = 65
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ColorScale:
-    """What the colours of a surface tell."""
+    """What the colours of a surface mean."""
 
     name: str
     """For the viewer: values of a surface have it, too."""
@@ -75,7 +75,7 @@ class ColorScale:
 
 
 def deviation_scale(end_um: float) -> ColorScale:
-    """Of deviations from a reference: green within a quarter of the range to either side."""
+    """Colour scale of deviations from a reference: green within a quarter of the range to either side."""
     return ColorScale(
         name="deviation",
         label="Deviation",
@@ -87,7 +87,8 @@ def deviation_scale(end_um: float) -> ColorScale:
 
 
 def sigma_scale(sigma_um: Float[np.ndarray, "v"], *, has_scale: bool = True) -> ColorScale:
-    """Of standard deviations, most of which it holds; of a scan without a scale, in thousandths of its unit."""
+    """Colour scale of standard deviations, whose range covers most of them; for a scan without a scale, in thousandths
+    of its unit."""
     return ColorScale(
         name="sigma",
         label="Expected",
@@ -101,7 +102,7 @@ def sigma_scale(sigma_um: Float[np.ndarray, "v"], *, has_scale: bool = True) -> 
 
 
 def small_unit(has_scale: bool) -> str:
-    """Of small lengths on a surface, for people."""
+    """Unit for small lengths on a surface, as text."""
     return "µm" if has_scale else "thousandths of its unit"
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt8
 
 from cuspid.model.panorama import FrameUse, Panorama
 from cuspid.report.pages.page import jpeg_uri, number, photo_uri, picture_uri, provenance, render_page, signed_number
@@ -53,7 +52,7 @@ def _part(part: Panorama, folder: Path) -> dict[str, Any]:
     height, width = part.covered.shape
     return {
         "title": "The arch from above" if part.parts == 1 else f"Part {part.part} of {part.parts}",
-        "picture": jpeg_uri(_on_ground(part.image, part.covered), widest_px=_WIDEST_PX),
+        "picture": jpeg_uri(np.where(part.covered[..., None], part.image, _GROUND), widest_px=_WIDEST_PX),
         "caption": f"{width} × {height} px",
         "width_px": width,
         "mm_per_px": part.mm_per_px,
@@ -79,10 +78,6 @@ _STRIPS = {
     "lingual/strip.png": "Unrolled along the arch, seen from the tongue; mirrored, so that all strips show the same "
     "place of the arch in the same column.",
 }
-
-
-def _on_ground(image: UInt8[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    return np.where(covered[..., None], image, _GROUND)
 
 
 def _reasons(frames: tuple[FrameUse, ...]) -> dict[str, list[str]]:

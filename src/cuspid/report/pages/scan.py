@@ -70,7 +70,7 @@ class ReportOptions(Options):
 
 
 _NO_SCALE = (
-    "scale: nothing tells it, so all lengths and areas are in a unit of this surface's own, not in millimetres or "
+    "scale: unknown, so all lengths and areas are in an arbitrary unit, not in millimetres or "
     "micrometres, whatever is written beside them"
 )
 
@@ -104,7 +104,10 @@ def scan_page(result: ScanResult, options: ReportOptions = ReportOptions()) -> s
         statistics=[METRICS[name] for name in STATISTICS],
         rows=_table(result.trueness),
         histogram=None if result.deviation_um is None else histogram(scan, result.deviation_um, range_um),
-        worst=[{"number": k + 1, **row} for k, row in enumerate(_worst_rows(worst))],
+        worst=[
+            {"number": number, "place": place.name, "at": place.position_mm, "um": um}
+            for number, (place, um) in enumerate(worst.items(), start=1)
+        ],
         frames=_frames(result.capture, options.frames, result.reconstruction is not None),
         dropped=[] if result.reconstruction is None else result.reconstruction.dropped,
         cleaning=result.cleaning,
@@ -301,10 +304,6 @@ def _tooth_at(reference: Jaw | None, at: Float[np.ndarray, "3"]) -> str:
         return "–"
     label = int(reference.face_labels[reference.mesh.closest(at[None])[1][0]])
     return "gum" if label == GUM else str(label)
-
-
-def _worst_rows(worst: Mapping[Place, float]) -> list[dict[str, Any]]:
-    return [{"place": place.name, "at": place.position_mm, "um": um} for place, um in worst.items()]
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

@@ -149,11 +149,11 @@ def _estimate(found: Mapping[str, Any] | None, digits: int = 1, *, plus: bool = 
     if found is None:
         return "–"
     digits += bool(digits) and abs(found["value"]) < _SMALL
-    told = (signed_number if plus else number)(found["value"], digits)
+    text = (signed_number if plus else number)(found["value"], digits)
     if found["low"] is None:
-        return told
+        return text
     show = signed_number if plus else number
-    return f"{told} ({show(found['low'], digits)} to {show(found['high'], digits)})"
+    return f"{text} ({show(found['low'], digits)} to {show(found['high'], digits)})"
 
 
 def _size(value: float | None) -> str:
@@ -217,7 +217,7 @@ def _modes_table(scanners: Mapping[str, Any]) -> Table:
     return {
         "title": "Deformation of the arch",
         "caption": "Means with 95 % intervals. Spread: the arch opens; lift: both ends rise; twist: one rises, one "
-        "sinks; how far the ends move while the middle is held. Remainder: of the deviations, without them.",
+        "sinks; how far the ends move while the middle is fixed. Remainder: of the deviations, without them.",
         "heads": ["scanner", *(_HEADS[figure] for figure in _MODES)],
         "rows": rows,
     }
@@ -262,7 +262,8 @@ def _parts_table(summary: Mapping[str, Any]) -> Table:
     return {
         "title": "Positions and axes",
         "caption": "Mean distance of each sphere or scan body from its place in the reference after the alignment, and "
-        "between repeats. Published figures are of other objects and other alignments: a measure of size, no more.",
+        "between repeats. Published figures are of other objects and other alignments: they only indicate the order "
+        "of size.",
         "heads": ["parts", "number", "trueness, µm", "precision, µm", "axis, °"],
         "rows": rows,
     }

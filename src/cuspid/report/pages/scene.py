@@ -71,7 +71,7 @@ def deviation_range_um(result: ScanResult) -> float:
 
 
 def has_scale(result: ScanResult) -> bool:
-    """Whether lengths of a scan are millimetres: photographs alone tell no scale."""
+    """Whether lengths of a scan are millimetres: photographs alone have none."""
     return result.reconstruction is None or result.reconstruction.has_scale
 
 

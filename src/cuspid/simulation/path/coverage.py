@@ -61,8 +61,11 @@ class CrownPoints:
         """Whether two cameras see each of some points from each of several poses, given relative to one pose."""
         cameras = handpiece.rig.cameras.values()
         seen = np.empty((len(pose_from_rig), len(which)), dtype=np.bool_)
-        _seen_by_two(
-            *(self.points[which], self.normals[which], self.open[which], self.nearest),
+        _mark_seen_by_two(
+            self.points[which],
+            self.normals[which],
+            self.open[which],
+            self.nearest,
             compose_motions(pose_from_rig, rig_from_world),
             compose_motions([each.cam_from_rig for each in cameras], Rigid3.identity()),
             np.array([np.concatenate(slope_bounds(each.camera)) for each in cameras]),
@@ -83,9 +86,9 @@ def crown_faces(jaw: Jaw, curve: ArchCurve) -> Bool[np.ndarray, "f"]:
 
 def crown_points(jaw: Jaw, curve: ArchCurve, reach_mm: float) -> CrownPoints:
     """Points on the crowns, and in which directions something stands within ``reach_mm`` of them."""
-    wanted = crown_faces(jaw, curve)
-    crowns = jaw.mesh.submesh(wanted)
-    labels = np.full(len(wanted), GUM) if jaw.face_labels is None else jaw.face_labels
+    selected = crown_faces(jaw, curve)
+    crowns = jaw.mesh.submesh(selected)
+    labels = np.full(len(selected), GUM) if jaw.face_labels is None else jaw.face_labels
     count = max(int(crowns.face_areas.sum() / _AREA_MM2), 1)
     points, faces = crowns.sample(count, np.random.default_rng(0))
     is_open = openness(jaw.mesh, points, crowns.face_normals[faces], OPENNESS_REACH_MM) >= LEAST_OPENNESS
@@ -97,7 +100,7 @@ def crown_points(jaw: Jaw, curve: ArchCurve, reach_mm: float) -> CrownPoints:
     return CrownPoints(
         points=points,
         normals=normals,
-        teeth=labels[wanted][faces],
+        teeth=labels[selected][faces],
         open=open_,
         directions=directions,
         nearest=_nearest_table(directions),
@@ -120,7 +123,7 @@ def _nearest_table(directions: Float[np.ndarray, "d 3"]) -> Int[np.ndarray, "lat
 
 @kernel
 @no_type_check
-def _seen_by_two(points, normals, open_, nearest, poses, cameras, bounds, depths, seen):
+def _mark_seen_by_two(points, normals, open_, nearest, poses, cameras, bounds, depths, seen):
     latitudes, longitudes = nearest.shape
     near, inside, own = np.empty(len(points), np.int64), np.empty(len(points), np.bool_), np.empty((3, len(points)))
     counts = np.empty(len(points), np.int64)
@@ -131,7 +134,7 @@ def _seen_by_two(points, normals, open_, nearest, poses, cameras, bounds, depths
         found = _within(points, eyes, longest, near, own)
         counts[:] = 0
         for c in range(len(eyes)):
-            _in_image(own, found, rotations[c], translations[c], bounds[c], depths, inside)
+            _mark_in_image(own, found, rotations[c], translations[c], bounds[c], depths, inside)
             x, y, z = eyes[c]
             for i in range(found):
                 n = near[i]
@@ -185,7 +188,7 @@ def _within(points, eyes, longest, near, own):
 
 @kernel
 @no_type_check
-def _in_image(own, found, r, t, bounds, depths, inside):
+def _mark_in_image(own, found, r, t, bounds, depths, inside):
     """Which of the points lie in an image and in focus: without branches, so that several are computed at once."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = r.ravel()
     t0, t1, t2 = t

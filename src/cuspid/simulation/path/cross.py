@@ -107,7 +107,7 @@ def _crossing(mesh: Mesh, room: Room, curve: ArchCurve, start_mm: float, end_mm:
     heights = _heights(mesh, ends[0].translation, ends[1].translation, max(3, 1 + round(length / _STEP_MM)))
     if not np.isfinite(heights).all():
         return None
-    poses = list(_following(ends[0], ends[1], heights, length))
+    poses = list(_follow_surface(ends[0], ends[1], heights, length))
     lifts = least_lifts(room, poses)
     if not np.isfinite(lifts).all():
         return None
@@ -130,7 +130,9 @@ def _heights(
     return np.asarray(_ABOVE_MM - hits.distances.reshape(count, -1).min(axis=1))
 
 
-def _following(start: Rigid3, end: Rigid3, heights_mm: Float[np.ndarray, "n"], length_mm: float) -> Iterator[Rigid3]:
+def _follow_surface(
+    start: Rigid3, end: Rigid3, heights_mm: Float[np.ndarray, "n"], length_mm: float
+) -> Iterator[Rigid3]:
     """``rig_from_world`` along the surface, from ``world_from_rig`` at the start to that at the end."""
     step = length_mm / (len(heights_mm) - 1)
     at = np.arange(len(heights_mm)) * step

@@ -141,7 +141,7 @@ def plan_detour(
     """The changes that make a steady handpiece fit everywhere."""
     travel = np.linspace(*span_mm, max(2, 1 + round((span_mm[1] - span_mm[0]) / _STATION_MM)))
     poses = [steady(float(at)) for at in travel]
-    blocked, choose = ~room.fits_at(poses), partial(_fitting, room, crowns, handpiece)
+    blocked, choose = ~room.fits_at(poses), partial(_fitting_changes, room, crowns, handpiece)
     return Detour(travel_mm=travel, changes=_changes(poses, blocked, choose))
 
 
@@ -151,9 +151,11 @@ def repair_path(room: Room, rig_from_world: Sequence[Rigid3]) -> list[Rigid3]:
     if not blocked.any():
         return list(rig_from_world)
     roomy = replace(room, clearance_mm=room.clearance_mm + _MARGIN_MM)
-    needed = np.array([_least(roomy, rig_from_world[index])[0][0] for index in np.flatnonzero(blocked).tolist()])
+    needed = np.array(
+        [_least_changes(roomy, rig_from_world[index])[0][0] for index in np.flatnonzero(blocked).tolist()]
+    )
     parts = np.multiply.outer(_SHARES, needed[np.linspace(0, len(needed) - 1, min(len(needed), _NEEDED)).astype(int)])
-    changes = _changes(rig_from_world, blocked, partial(_eased_least, roomy, parts.reshape(-1, 6)))
+    changes = _changes(rig_from_world, blocked, partial(_eased_changes, roomy, parts.reshape(-1, 6)))
     return [
         _motion(change) @ pose if change.any() else pose for change, pose in zip(changes, rig_from_world, strict=True)
     ]
@@ -173,21 +175,21 @@ def _changes(
     return changes
 
 
-def _fitting(room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3) -> _Choice:
+def _fitting_changes(room: Room, crowns: CrownPoints, handpiece: Handpiece, pose: Rigid3) -> _Choice:
     """The best candidates at a station that fit."""
     near = crowns.within(pose.inverse().translation[None], _REACH_MM)
     near = near[np.abs(pose.apply(crowns.points[near])[:, 0]) < _BESIDE_MM]
     return _best(room, pose, _coarse(), partial(_coverage_cost, crowns, near, handpiece, pose))
 
 
-def _least(room: Room, pose: Rigid3) -> _Choice:
+def _least_changes(room: Room, pose: Rigid3) -> _Choice:
     """Those that change a frame least."""
     return _best(room, pose, _fine(), lambda motions: np.zeros(len(motions)))
 
 
-def _eased_least(room: Room, parts: Float[np.ndarray, "k 6"], pose: Rigid3) -> _Choice:
+def _eased_changes(room: Room, parts: Float[np.ndarray, "k 6"], pose: Rigid3) -> _Choice:
     """Those, and parts of what frames nearby need, so that there is a smooth way to it."""
-    changes, costs = _least(room, pose)
+    changes, costs = _least_changes(room, pose)
     fits = room.fits(pose, [_motion(part) for part in parts])
     return np.concatenate([changes, parts[fits]]), np.concatenate([costs, _deviation_cost(parts[fits])])
 

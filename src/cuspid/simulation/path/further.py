@@ -77,7 +77,7 @@ def _largest_sum(values: Float[np.ndarray, "n"]) -> tuple[int, int]:
 
 def further_legs(mesh: Mesh, room: Room, crowns: CrownPoints, handpiece: Handpiece, steady: SteadyPath) -> SteadyPath:
     """The path with the further passes that are worthwhile."""
-    unseen = np.asarray(~seen_from(crowns, handpiece, list(_stations(steady))).any(axis=0))
+    unseen = np.asarray(~points_seen_from(crowns, handpiece, list(_stations(steady))).any(axis=0))
     trials = [_trial(mesh, room, crowns, handpiece, steady, roll) for roll in _ROLLS_DEG]
     legs = list[Leg]()
     while len(legs) < _MOST:
@@ -90,10 +90,10 @@ def further_legs(mesh: Mesh, room: Room, crowns: CrownPoints, handpiece: Handpie
         legs.append(Leg(roll_deg=trials[best].roll_deg, start_mm=low, end_mm=high))
         within = (trials[best].lengths_mm >= low) & (trials[best].lengths_mm <= high)
         unseen &= ~trials[best].seen[within].any(axis=0)
-    return steady_path(mesh, steady.curve, tuple(_woven(steady.legs, legs))) if legs else steady
+    return steady_path(mesh, steady.curve, tuple(_interleave_legs(steady.legs, legs))) if legs else steady
 
 
-def _woven(first: Sequence[Leg], further: Sequence[Leg]) -> Iterator[Leg]:
+def _interleave_legs(first: Sequence[Leg], further: Sequence[Leg]) -> Iterator[Leg]:
     """All legs in order: further ones over a stretch are gone through on the way, or at the end where that is shorter.
 
     On the way means when the last of the first legs has come to the end of the stretch; it goes on from there.
@@ -155,8 +155,8 @@ def _trial(
     first = steady.legs[0]
     low, high = sorted((first.start_mm, first.end_mm))
     path = steady_path(mesh, steady.curve, (Leg(roll_deg=roll_deg, start_mm=low, end_mm=high),))
-    poses = [_least_lifted(room, pose) for pose in _stations(path)]
-    seen = seen_from(crowns, handpiece, [pose or Rigid3.identity() for pose in poses])
+    poses = [_lift_to_fit(room, pose) for pose in _stations(path)]
+    seen = points_seen_from(crowns, handpiece, [pose or Rigid3.identity() for pose in poses])
     seen[[pose is None for pose in poses]] = False
     return _Trial(roll_deg, np.linspace(low, high, len(poses)), seen)
 
@@ -167,13 +167,13 @@ def _stations(path: SteadyPath) -> Iterator[Rigid3]:
         yield path.rig_from_world(float(at))
 
 
-def _least_lifted(room: Room, pose: Rigid3) -> Rigid3 | None:
+def _lift_to_fit(room: Room, pose: Rigid3) -> Rigid3 | None:
     """The pose, lifted by as little as is needed to fit; None where none of the lifts does."""
     lifts = [lifted_from_rig(lift) for lift in _LIFTS_MM]
     fits = room.fits(pose, lifts)
     return lifts[int(np.argmax(fits))] @ pose if fits.any() else None
 
 
-def seen_from(crowns: CrownPoints, handpiece: Handpiece, poses: Sequence[Rigid3]) -> Bool[np.ndarray, "p n"]:
+def points_seen_from(crowns: CrownPoints, handpiece: Handpiece, poses: Sequence[Rigid3]) -> Bool[np.ndarray, "p n"]:
     """Whether two cameras see each point of the crowns from each pose."""
     return crowns.seen_by_two(np.arange(len(crowns.points)), handpiece, Rigid3.identity(), poses)

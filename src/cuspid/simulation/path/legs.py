@@ -189,12 +189,12 @@ def _sinks(mesh: Mesh, curve: ArchCurve, stations_mm: Float[np.ndarray, "s"]) ->
         down = np.broadcast_to(-world_from_hold.rotation[:, 2], strip.shape)
         highest = _FAR_MM - float(mesh.cast(world_from_hold.apply(strip), down).distances.min())
         heights[index] = highest if np.isfinite(highest) else 0.0
-    between = np.logical_and(*(_any_before(heights > -_GAP_MM, order) for order in (1, -1)))
+    between = np.logical_and(*(_accumulate_any(heights > -_GAP_MM, order) for order in (1, -1)))
     heights[~between] = 0.0
     return np.asarray(np.maximum(-_follow_heights(heights, _GAP_NEAR_MM) - _GAP_MM, 0.0))
 
 
-def _any_before(which: Bool[np.ndarray, "s"], order: int) -> Bool[np.ndarray, "s"]:
+def _accumulate_any(which: Bool[np.ndarray, "s"], order: int) -> Bool[np.ndarray, "s"]:
     """Where one is true before, or, of order -1, behind."""
     return np.asarray(np.logical_or.accumulate(which[::order])[::order])
 

@@ -31,7 +31,7 @@ from cuspid.runtime.options import TOOTH, Options, Range
 from cuspid.simulation.path.coverage import CrownPoints, crown_points
 from cuspid.simulation.path.cross import plan_crossing
 from cuspid.simulation.path.detour import Detour, PoseAt, lift_path, plan_detour, repair_path
-from cuspid.simulation.path.further import further_legs, seen_from
+from cuspid.simulation.path.further import further_legs, points_seen_from
 from cuspid.simulation.path.hand import HandMotion, hand_motion
 from cuspid.simulation.path.legs import Leg, SteadyPath, steady_path, there_and_back
 from cuspid.simulation.path.overlap import frame_overlap, image_overlap
@@ -158,9 +158,9 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
     be seen from where the handpiece fits, or the given number of frames is too small for the overlap.
     """
     curve, room = arch_curve(jaw), room_about(jaw.mesh, handpiece, options.clearance_mm)
-    crowns = crown_points(jaw, curve, _reach_mm(handpiece))
+    crowns = crown_points(jaw, curve, handpiece.depth_range_mm[1])
     steady = first = steady_path(jaw.mesh, curve, _legs(jaw, curve, options))
-    if _goes_on(options, curve):
+    if _needs_further_passes(options, curve):
         steady = further_legs(jaw.mesh, room, crowns, handpiece, first)
     if options.cross_sweep:
         steady = _cross(jaw.mesh, room, handpiece, steady, options)
@@ -173,7 +173,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
         jitter_length_mm=options.jitter_length_mm,
     )
     pose_at = lift_path(room, _apply_drift(steady, detour, hand), steady.span_mm)
-    path = _with_frames(room, handpiece, first, steady, pose_at, options)
+    path = _sample_frames(room, handpiece, first, steady, pose_at, options)
     if not np.isfinite(path.overlap).any():
         raise InputError(
             f"scan path: with the handpiece {options.clearance_mm:g} mm from the jaw, no camera sees it in focus; "
@@ -190,7 +190,7 @@ def plan_scan_path(jaw: Jaw, handpiece: Handpiece, options: ScanPathOptions, rng
 
 def _seen_faces(crowns: CrownPoints, handpiece: Handpiece, path: ScanPath, tooth: int | None) -> dict[int, float]:
     """As :attr:`ScanPath.seen`."""
-    found = np.asarray(seen_from(crowns, handpiece, list(path.rig_from_world.values())).any(axis=0))
+    found = np.asarray(points_seen_from(crowns, handpiece, list(path.rig_from_world.values())).any(axis=0))
     if tooth is not None:
         return {tooth: float(found[crowns.teeth == tooth].mean())}
     teeth = np.unique(crowns.teeth[crowns.teeth != GUM])
@@ -210,7 +210,7 @@ def _legs(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[Leg, ..
     return there_and_back(options.rolls_deg, *_stretch(jaw, curve, options))
 
 
-def _goes_on(options: ScanPathOptions, curve: ArchCurve) -> bool:
+def _needs_further_passes(options: ScanPathOptions, curve: ArchCurve) -> bool:
     """Whether further passes go over what the first ones did not see."""
     if options.passes is not None:
         return options.passes == "auto"
@@ -250,11 +250,6 @@ def _stretch(jaw: Jaw, curve: ArchCurve, options: ScanPathOptions) -> tuple[floa
     return middle - half, middle + half
 
 
-def _reach_mm(handpiece: Handpiece) -> float:
-    """How far from a point of the surface something may hide it."""
-    return handpiece.depth_range_mm[1]
-
-
 def _apply_drift(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt:
     """The trajectory of a hand that drifts."""
     if not detour.changes.any():
@@ -265,7 +260,7 @@ def _apply_drift(steady: SteadyPath, detour: Detour, hand: HandMotion) -> PoseAt
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
-def _with_frames(
+def _sample_frames(
     room: Room,
     handpiece: Handpiece,
     first: SteadyPath,
@@ -274,7 +269,7 @@ def _with_frames(
     options: ScanPathOptions,
 ) -> ScanPath:
     """As many frames as asked for, or as many as the overlap needs; ``first`` is the path without further passes."""
-    usual = options.frames or _usual_frames(steady, first, options)
+    usual = options.frames or _default_frames(steady, first, options)
     frames = usual
     while True:
         path = _even_path(room, handpiece, steady, pose_at, frames)
@@ -293,7 +288,7 @@ def _with_frames(
         frames = needed
 
 
-def _usual_frames(steady: SteadyPath, first: SteadyPath, options: ScanPathOptions) -> int:
+def _default_frames(steady: SteadyPath, first: SteadyPath, options: ScanPathOptions) -> int:
     """Of the thesis for a tooth and a whole arch, one per millimetre for parts; for further passes in proportion."""
     length = first.legs[0].length_mm
     per_pass = TOOTH_FRAMES if options.tooth is not None else ARCH_FRAMES if length > _ARCH_MM else 1 + round(length)
@@ -357,12 +352,12 @@ def _detour_notes(jaw: Jaw, steady: SteadyPath, detour: Detour) -> tuple[str, ..
     _, shift, lift, *turns = detour.largest
     places = np.array([steady.curve.place(steady.place(float(at))[0]) for at in detour.travel_mm[changed]])
     return (
-        f"scan path: the handpiece does not fit everywhere{_near_teeth(jaw, places)}; there it is lifted by up to "
-        f"{lift:.1f} mm, shifted by {shift:.1f} mm and tilted by {np.rad2deg(max(turns)):.0f} deg",
+        f"scan path: the handpiece does not fit everywhere{_describe_teeth_near(jaw, places)}; there it is lifted by "
+        f"up to {lift:.1f} mm, shifted by {shift:.1f} mm and tilted by {np.rad2deg(max(turns)):.0f} deg",
     )
 
 
-def _near_teeth(jaw: Jaw, places: Float[np.ndarray, "n 3"]) -> str:
+def _describe_teeth_near(jaw: Jaw, places: Float[np.ndarray, "n 3"]) -> str:
     if not jaw.teeth:
         return ""
     centres = np.array([jaw.mesh.centroid(jaw.tooth_faces(tooth))[:2] for tooth in jaw.teeth])
@@ -399,7 +394,7 @@ def _crossing_notes(jaw: Jaw, path: ScanPath) -> tuple[str, ...]:
         )
     ends = np.array([path.curve.place(at) for at in (crossing.start_mm, crossing.end_mm)])
     return (
-        f"scan path: the sweep across{_near_teeth(jaw, ends)} takes frames {swept[0]} to {swept[-1]}, "
+        f"scan path: the sweep across{_describe_teeth_near(jaw, ends)} takes frames {swept[0]} to {swept[-1]}, "
         f"{len(swept)} of {len(path.rig_from_world)}; it covers {np.linalg.norm(ends[1] - ends[0]):.0f} mm from one "
         "side to the other",
     )

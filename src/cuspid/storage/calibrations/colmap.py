@@ -1,5 +1,5 @@
 """COLMAP's ``rig_config.json``, and its sparse models as text (``cameras.txt`` and ``images.txt``); and cuspid's own
-``handpiece.json``. None of them tells a unit but the last."""
+``handpiece.json``. Only the last of them states a unit."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def read_config(files: Mapping[str, Document], hints: Hints) -> Calibration:
     """The cameras of a rig. Raises InputError."""
     (document,) = files.values()
     rig = rig_from_config(document.value, hints.image_size_px)
-    told = hints.image_size_px or all("camera_size" in each for each in document.value[0]["cameras"])
+    has_size = hints.image_size_px or all("camera_size" in each for each in document.value[0]["cameras"])
     guessed = "the file has no image sizes; twice the principal point is assumed (--image-size W H)"
-    return Calibration(cameras=rig.cameras, notes=() if told else (guessed,))
+    return Calibration(cameras=rig.cameras, notes=() if has_size else (guessed,))
 
 
 def write_config(cameras: Mapping[str, MountedCamera], suffix: str) -> str:
-    """With ``camera_size``, which COLMAP passes over."""
+    """Writes the configuration with ``camera_size``, which COLMAP ignores."""
     return json.dumps(rig_to_config(Rig(cameras)), indent=2) + "\n"
 
 
@@ -70,7 +70,7 @@ def read_handpiece(files: Mapping[str, Document], hints: Hints) -> Calibration:
 
 def recognises_model(files: Mapping[str, Document]) -> bool:
     """Whether these are a model's cameras, and perhaps its images."""
-    files = _alone(files)
+    files = _as_cameras(files)
     if "cameras" not in files or not set(files) <= {"cameras", "images", "points3D", "rigs", "frames"}:
         return False
     rows = _rows(files["cameras"])
@@ -79,7 +79,7 @@ def recognises_model(files: Mapping[str, Document]) -> bool:
 
 def read_model(files: Mapping[str, Document], hints: Hints) -> Calibration:
     """A camera for each image, or, without images, one alone. Raises InputError."""
-    files = _alone(files)
+    files = _as_cameras(files)
     lenses = {row[0]: _lens(row) for row in _rows(files["cameras"])}
     if "images" not in files:
         if len(lenses) != 1:
@@ -97,7 +97,7 @@ def read_model(files: Mapping[str, Document], hints: Hints) -> Calibration:
     return Calibration(cameras=cameras)
 
 
-def _alone(files: Mapping[str, Document]) -> Mapping[str, Document]:
+def _as_cameras(files: Mapping[str, Document]) -> Mapping[str, Document]:
     """A single file, whatever its name, has the cameras."""
     return {"cameras": next(iter(files.values()))} if len(files) == 1 else files
 
@@ -111,7 +111,7 @@ def _rows(document: Document) -> list[list[str]]:
 def _image_rows(document: Document) -> list[list[str]]:
     """Those of the images: of each pair of lines the first, the second has its points and may be empty."""
     if document.kind != "text":
-        raise InputError("images.txt is no list of COLMAP's images")
+        raise InputError("images.txt is not a list of COLMAP's images")
     lines = [line.split() for line in document.value.splitlines() if not line.startswith("#")]
     rows = [row for row in lines[::2] if row]
     if any(len(row) < 10 for row in rows):

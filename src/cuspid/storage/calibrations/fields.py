@@ -33,7 +33,7 @@ class Calibration:
     cameras: Mapping[str, MountedCamera]
     """By name, in order; translations are in :attr:`unit`."""
     unit: Unit | None = None
-    """Of lengths; None where the file does not tell."""
+    """Of lengths; None where the file does not state it."""
     losses: Mapping[str, Loss] = field(default_factory=dict)
     """Of the cameras whose lens has no counterpart."""
     notes: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ class Hints:
     """What the user says of a file."""
 
     image_size_px: tuple[int, int] | None = None
-    """Of its images, where the file does not tell."""
+    """Of its images, where the file does not state it."""
 
 
 def require_list(what: str, value: Any) -> list[Any]:
@@ -117,7 +117,7 @@ def image_size(what: str, width: Any, height: Any) -> tuple[int, int]:
 
 
 def assumed_size(principal_px: Sequence[float], hints: Hints) -> tuple[tuple[int, int], str | None]:
-    """The size of images of which a file does not tell: as the user says, or twice the principal point; and what is to
+    """The size of images whose file does not state it: as the user says, or twice the principal point; and what is to
     be said of it."""
     if hints.image_size_px is not None:
         return hints.image_size_px, None
@@ -167,7 +167,7 @@ def brown(coefficients: Float[np.ndarray, "n"]) -> tuple[str, list[float]]:
 
 
 def scale_lengths(mounted: MountedCamera, factor: float) -> MountedCamera:
-    """With its lengths in another unit."""
+    """The calibration with its lengths in another unit."""
     shift = np.diag([1.0, 1, 1, factor, factor, factor])
     covariance = None if mounted.covariance is None else shift @ mounted.covariance @ shift
     moved = Rigid3(mounted.cam_from_rig.rotation, mounted.cam_from_rig.translation * factor)

@@ -18,7 +18,7 @@ from cuspid.runtime.errors import InputError
 from cuspid.runtime.values import checked_name, number, quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, vector
-from cuspid.storage.calibrations.lenses import Lens, Loss, of_projection
+from cuspid.storage.calibrations.lenses import Lens, Loss, fit_projection
 
 LENSES: tuple[Lens, ...] = ()
 _FIELD = re.compile(r"^\s*([A-Za-z]\w*)\s*:\s*\w+\s*:\s*([^;:]+?)\s*;", re.MULTILINE)
@@ -55,30 +55,30 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
 
 def _pose(text: str) -> Rigid3:
     """HALCON's usual pose, type 0: turned by R_x(a) R_y(b) R_z(c), degrees."""
-    told = dict(_POSE.findall(text))
-    if told["f"].strip() != "0":
-        raise InputError(f"its pose has the type {quote(told['f'])}; convert it to type 0 (convert_pose_type)")
-    angles, shift = (vector("pose", [float(word) for word in told[each].split()], 3) for each in ("r", "t"))
+    fields = dict(_POSE.findall(text))
+    if fields["f"].strip() != "0":
+        raise InputError(f"its pose has the type {quote(fields['f'])}; convert it to type 0 (convert_pose_type)")
+    angles, shift = (vector("pose", [float(word) for word in fields[each].split()], 3) for each in ("r", "t"))
     return Rigid3(Rotation.from_euler("XYZ", angles, degrees=True).as_matrix(), shift)
 
 
 def _camera(what: str, text: str) -> tuple[Camera, Loss | None]:
-    told = {name: float(value) for name, value in _FIELD.findall(text) if name != "ParGroup"}
-    size = image_size(what, told["ImageWidth"], told["ImageHeight"])
-    focus, sx, sy = (number(f"{what}: {each}", told[each], 1e-9, 1e3) for each in ("Focus", "Sx", "Sy"))
-    focal, centre = np.array([focus / sx, focus / sy]), np.array([told["Cx"], told["Cy"]])
+    fields = {name: float(value) for name, value in _FIELD.findall(text) if name != "ParGroup"}
+    size = image_size(what, fields["ImageWidth"], fields["ImageHeight"])
+    focus, sx, sy = (number(f"{what}: {each}", fields[each], 1e-9, 1e3) for each in ("Focus", "Sx", "Sy"))
+    focal, centre = np.array([focus / sx, focus / sy]), np.array([fields["Cx"], fields["Cy"]])
     pinhole = camera(what, size, focal, centre, [0.0] * 4, "OPENCV")
-    if "Kappa" not in told and not all(each in told for each in _POLYNOMIAL):
+    if "Kappa" not in fields and not all(each in fields for each in _POLYNOMIAL):
         raise InputError(f"{what}: it has neither Kappa nor {', '.join(_POLYNOMIAL)}; only area scan cameras are read")
-    if not any(told.get(each, 0.0) for each in ("Kappa", *_POLYNOMIAL)):
+    if not any(fields.get(each, 0.0) for each in ("Kappa", *_POLYNOMIAL)):
         return pinhole, None
-    if "Kappa" in told:
-        kappa = number(f"{what}: Kappa", told["Kappa"], -1e12, 1e12) * focus**2
-        return of_projection(lambda points: _distort_division(kappa, pinhole, points), size, "the division model")
-    k1, k2, k3, p1, p2 = (told[each] for each in _POLYNOMIAL)
+    if "Kappa" in fields:
+        kappa = number(f"{what}: Kappa", fields["Kappa"], -1e12, 1e12) * focus**2
+        return fit_projection(lambda points: _distort_division(kappa, pinhole, points), size, "the division model")
+    k1, k2, k3, p1, p2 = (fields[each] for each in _POLYNOMIAL)
     values = [k1 * focus**2, k2 * focus**4, p2 * focus, p1 * focus, k3 * focus**6, 0.0, 0.0, 0.0]
     inverse = camera(what, size, focal, centre, values, "FULL_OPENCV")
-    return of_projection(lambda points: _invert_division(inverse, points), size, "the polynomial model")
+    return fit_projection(lambda points: _invert_division(inverse, points), size, "the polynomial model")
 
 
 def _plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:

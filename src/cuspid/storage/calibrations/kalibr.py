@@ -18,7 +18,7 @@ from cuspid.runtime.errors import InputError
 from cuspid.runtime.values import checked_name, quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, motion, require_mapping, vector
-from cuspid.storage.calibrations.lenses import BROWN_4, FISHEYE, Lens, Loss, of_projection
+from cuspid.storage.calibrations.lenses import BROWN_4, FISHEYE, Lens, Loss, fit_projection
 
 LENSES: tuple[Lens, ...] = (BROWN_4, FISHEYE)
 _EXTRA = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}
@@ -76,7 +76,7 @@ def _camera(name: str, entry: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
             plane = _DISTORTIONS[distortion](coefficients, _PLANES[model](own, points))
         return plane * focal + centre + OPENCV_PIXEL_OFFSET
 
-    return of_projection(project, size, model if distortion == "none" else f"{model} with {distortion}")
+    return fit_projection(project, size, model if distortion == "none" else f"{model} with {distortion}")
 
 
 def _project_pinhole(points: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:

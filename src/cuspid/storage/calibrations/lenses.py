@@ -104,7 +104,7 @@ def _grid(camera: Camera) -> Float[np.ndarray, "n 2"]:
     return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
-def of_projection(
+def fit_projection(
     project: Projection, size_px: tuple[int, int], said: str, lenses: Sequence[Lens] = (RATIONAL, FISHEYE, THIN_PRISM)
 ) -> tuple[Camera, Loss]:
     """The camera nearest to one of another model, which is given by how it projects. Raises InputError where that shows

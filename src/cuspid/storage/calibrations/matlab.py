@@ -84,12 +84,12 @@ def _second_from_first(values: Mapping[str, Any]) -> Rigid3:
         turn = matrix("RotationOfCamera2", values["RotationOfCamera2"], 3, 3).T
         shift = vector("TranslationOfCamera2", values["TranslationOfCamera2"], 3)
     else:
-        told = require_mapping("PoseCamera2", values["PoseCamera2"])
-        if "A" in told:
-            whole = matrix("PoseCamera2", told["A"], 4, 4)
+        pose = require_mapping("PoseCamera2", values["PoseCamera2"])
+        if "A" in pose:
+            whole = matrix("PoseCamera2", pose["A"], 4, 4)
             turn, shift = whole[:3, :3], whole[:3, 3]
         else:
-            turn, shift = matrix("PoseCamera2", told["R"], 3, 3), vector("PoseCamera2", told["Translation"], 3)
+            turn, shift = matrix("PoseCamera2", pose["R"], 3, 3), vector("PoseCamera2", pose["Translation"], 3)
     return Rigid3(nearest_rotation("the rotation of camera 2", turn), shift)
 
 
@@ -117,14 +117,14 @@ def _camera(what: str, values: Mapping[str, Any], hints: Hints) -> tuple[Camera,
 
 def write(cameras: Mapping[str, MountedCamera], suffix: str) -> str:
     """For ``stereoParameters(jsondecode(fileread(...)))``, or ``cameraParameters`` of one camera."""
-    told = [_struct(each.camera) for each in cameras.values()]
-    if len(told) == 1:
-        return json.dumps(told[0], indent=2) + "\n"
+    structs = [_struct(each.camera) for each in cameras.values()]
+    if len(structs) == 1:
+        return json.dumps(structs[0], indent=2) + "\n"
     first, second = cameras.values()
     second_from_first = second.cam_from_rig @ first.cam_from_rig.inverse()
     values = {
-        "CameraParameters1": told[0],
-        "CameraParameters2": told[1],
+        "CameraParameters1": structs[0],
+        "CameraParameters2": structs[1],
         "RotationOfCamera2": second_from_first.rotation.T.tolist(),
         "TranslationOfCamera2": second_from_first.translation.tolist(),
     }

@@ -1,6 +1,6 @@
 """Metashape's cameras in XML (Agisoft Metashape Professional, user manual, appendix "Camera models"): the principal
-point is told from the middle of the image, p1 and p2 are OpenCV's p2 and p1, the focal lengths are f + b1 and f, b2 is
-skew, and transforms are ``chunk_from_camera`` with OpenCV's axes."""
+point is relative to the middle of the image, p1 and p2 are OpenCV's p2 and p1, the focal lengths are f + b1 and f, b2
+is skew, and transforms are ``chunk_from_camera`` with OpenCV's axes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cuspid.runtime.errors import InputError
 from cuspid.runtime.values import checked_name, number, quote
 from cuspid.storage.calibrations.documents import Document
 from cuspid.storage.calibrations.fields import Calibration, Hints, camera, image_size, motion
-from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE_TANGENTIAL, Lens, Loss, of_projection
+from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE_TANGENTIAL, Lens, Loss, fit_projection
 from cuspid.storage.units import Unit
 
 LENSES: tuple[Lens, ...] = (BROWN_5, FISHEYE_TANGENTIAL)
@@ -131,7 +131,7 @@ def _camera(what: str, sensor: Element) -> tuple[Camera, Loss | None]:
         return pixels + np.stack([skew, np.zeros(len(skew))], axis=1)
 
     more = " and ".join(name for name, value in (("b2", b2), ("k4", k4)) if value)
-    return of_projection(project, size, f"a lens with {more}")
+    return fit_projection(project, size, f"a lens with {more}")
 
 
 def write(cameras: Mapping[str, MountedCamera], suffix: str) -> str:

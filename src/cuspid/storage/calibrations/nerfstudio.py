@@ -25,7 +25,7 @@ from cuspid.storage.calibrations.fields import (
     require_list,
     require_mapping,
 )
-from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, Lens, Loss, of_projection
+from cuspid.storage.calibrations.lenses import BROWN_5, FISHEYE, Lens, Loss, fit_projection
 
 LENSES: tuple[Lens, ...] = (BROWN_5, FISHEYE)
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
@@ -53,10 +53,12 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
         checked_name("file_path", name)
         if name in cameras:
             raise InputError(f"two frames have the image {name}; each needs its own")
-        told = {**shared, **frame}
-        key = json.dumps({each: value for each, value in told.items() if each in _FIELDS}, sort_keys=True, default=str)
+        fields = {**shared, **frame}
+        key = json.dumps(
+            {each: value for each, value in fields.items() if each in _FIELDS}, sort_keys=True, default=str
+        )
         if key not in known:
-            known[key] = _camera(f"frame {name}", told)
+            known[key] = _camera(f"frame {name}", fields)
         made, loss = known[key]
         world_from_opengl = motion(f"frame {name}: transform_matrix", frame["transform_matrix"])
         world_from_camera = world_from_opengl @ Rigid3(_OPENGL_FROM_OPENCV, np.zeros(3))
@@ -81,20 +83,20 @@ def _names(paths: list[PurePosixPath]) -> list[str]:
     return ["/".join(each) for each in parts]
 
 
-def _camera(what: str, told: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
-    size = image_size(what, told["w"], told["h"])
+def _camera(what: str, fields: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
+    size = image_size(what, fields["w"], fields["h"])
     width, height = size
-    if "fl_x" in told:
-        fx = number(f"{what}: fl_x", told["fl_x"], 1.0, 1e7)
+    if "fl_x" in fields:
+        fx = number(f"{what}: fl_x", fields["fl_x"], 1.0, 1e7)
     else:
-        fx = width / 2 / np.tan(number(f"{what}: camera_angle_x", told["camera_angle_x"], 1e-3, 3.1) / 2)
-    focal = [fx, number(f"{what}: fl_y", told.get("fl_y", fx), 1.0, 1e7)]
-    centre = [told.get("cx", width / 2), told.get("cy", height / 2)]
-    model = told.get("camera_model", "OPENCV")
+        fx = width / 2 / np.tan(number(f"{what}: camera_angle_x", fields["camera_angle_x"], 1e-3, 3.1) / 2)
+    focal = [fx, number(f"{what}: fl_y", fields.get("fl_y", fx), 1.0, 1e7)]
+    centre = [fields.get("cx", width / 2), fields.get("cy", height / 2)]
+    model = fields.get("camera_model", "OPENCV")
     if model not in _MODELS:
         raise InputError(f"{what}: camera_model {quote(model)} is not supported; use one of {', '.join(_MODELS)}")
     names = ("k1", "k2", "k3", "k4", "p1", "p2")
-    k1, k2, k3, k4, p1, p2 = (number(f"{what}: {each}", told.get(each, 0.0), -_MOST, _MOST) for each in names)
+    k1, k2, k3, k4, p1, p2 = (number(f"{what}: {each}", fields.get(each, 0.0), -_MOST, _MOST) for each in names)
     if model == "OPENCV_FISHEYE":
         return camera(what, size, focal, centre, [k1, k2, k3, k4], model, pixel_offset=0.0), None
     distortion, kind = ([k1, k2, p1, p2], "OPENCV") if k3 == 0 else ([k1, k2, p1, p2, k3, 0.0, 0.0, 0.0], "FULL_OPENCV")
@@ -108,7 +110,7 @@ def _camera(what: str, told: Mapping[str, Any]) -> tuple[Camera, Loss | None]:
         more = k4 * (plane**2).sum(axis=1, keepdims=True) ** 4 * plane * made.focal_px
         return np.where(np.isfinite(plane), made.project(points) + more, np.nan)
 
-    return of_projection(project, size, "k4 of a perspective lens")
+    return fit_projection(project, size, "k4 of a perspective lens")
 
 
 def write(cameras: Mapping[str, MountedCamera], suffix: str) -> str:

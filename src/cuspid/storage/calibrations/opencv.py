@@ -31,7 +31,7 @@ from cuspid.storage.calibrations.fields import (
     require_mapping,
     vector,
 )
-from cuspid.storage.calibrations.lenses import FISHEYE, RATIONAL, Lens, Loss, of_projection
+from cuspid.storage.calibrations.lenses import FISHEYE, RATIONAL, Lens, Loss, fit_projection
 
 LENSES: tuple[Lens, ...] = (RATIONAL, FISHEYE)
 _MEANINGS = {
@@ -101,8 +101,8 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     return Calibration(cameras=cameras, losses=losses, notes=tuple(notes))
 
 
-def _name(found: Mapping[str, Any], usual: str) -> str:
-    return checked_name("camera_name", found.get("name", usual))
+def _name(found: Mapping[str, Any], default: str) -> str:
+    return checked_name("camera_name", found.get("name", default))
 
 
 def _merge_files(files: Mapping[str, Document]) -> Mapping[str, Any]:
@@ -183,7 +183,7 @@ def _camera(what: str, found: Mapping[str, Any], hints: Hints) -> tuple[Camera, 
     if np.any(given[8:]):
         model, parameters = brown(given[:8])
         plain = camera(what, size, focal, centre, parameters, model)
-        made, loss = of_projection(lambda points: _prism(plain, given, points), size, f"{len(given)} coefficients")
+        made, loss = fit_projection(lambda points: _prism(plain, given, points), size, f"{len(given)} coefficients")
         return made, loss, note
     model, parameters = brown(given[:8])
     return camera(what, size, focal, centre, parameters, model), None, note

@@ -1,4 +1,4 @@
-"""The formats by name; which of them a file has is told by its content, which of them it will have by its name."""
+"""The formats by name; that of a file to read follows from its content, that of a file to write from its name."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Format:
 
     title: str
     unit: Unit | None
-    """Of its lengths: where its files do not tell, the usual one."""
+    """Of its lengths: where its files do not state it, the usual one."""
     tells_unit: bool = False
     """Whether that is always the unit."""
     lenses: tuple[Lens, ...]
@@ -124,13 +124,13 @@ def read_calibration(
     image_size_px: tuple[int, int] | None = None,
 ) -> ReadCalibration:
     """Read a file, or the files of a folder where a program writes several. ``unit`` and ``image_size_px`` say what a
-    file does not tell, ``kind`` what it is. Raises InputError."""
+    file leaves out, ``kind`` what it is. Raises InputError."""
     files = _documents(path)
     with reading(path):
         name = kind or _recognise(files)
         found = FORMATS[name].read(files, Hints(image_size_px=image_size_px))
-        told, note = _unit(FORMATS[name], found, unit)
-        rig = Rig({each: scale_lengths(mounted, MM_PER_UNIT[told]) for each, mounted in found.cameras.items()})
+        unit_found, note = _unit(FORMATS[name], found, unit)
+        rig = Rig({each: scale_lengths(mounted, MM_PER_UNIT[unit_found]) for each, mounted in found.cameras.items()})
     return ReadCalibration(rig=rig, format=name, losses=found.losses, notes=found.notes + note)
 
 
@@ -152,14 +152,14 @@ def _recognise(files: Mapping[str, Document]) -> Name:
         if each.recognises(files):
             return name
     known = ", ".join(FORMATS)
-    raise InputError(f"it is no calibration that is known ({known}); cuspid rig convert takes it with --from")
+    raise InputError(f"it is no known calibration format ({known}); name it with cuspid rig convert --from")
 
 
 def _unit(format: Format, found: Calibration, given: Unit | None) -> tuple[Unit, tuple[str, ...]]:
     """The unit of lengths, and what is to be said of it."""
-    told = format.unit if format.tells_unit else found.unit
-    if given is not None or told is not None:
-        return given or told or "mm", ()
+    known_unit = format.unit if format.tells_unit else found.unit
+    if given is not None or known_unit is not None:
+        return given or known_unit or "mm", ()
     centres = [each.centre_in_rig for each in found.cameras.values()]
     apart = max((float(np.linalg.norm(one - other)) for one, other in combinations(centres, 2)), default=0.0)
     usual = format.unit or "mm"
@@ -167,7 +167,7 @@ def _unit(format: Format, found: Calibration, given: Unit | None) -> tuple[Unit,
         return usual, ()
     candidates: tuple[Unit, ...] = (usual, "m", "mm")
     likely = next((each for each in candidates if _NEAREST_MM <= apart * MM_PER_UNIT[each] <= _FARTHEST_MM), usual)
-    note = f"the file tells no unit of length; {likely} is assumed: its cameras are up to {apart:.4g} {likely} apart"
+    note = f"the file states no unit of length; {likely} is assumed: its cameras are up to {apart:.4g} {likely} apart"
     return likely, (f"{note} (--unit)",)
 
 
@@ -199,7 +199,7 @@ class CarriedOver:
     """What else is left out."""
 
 
-def carried_over(rig: Rig, kind: Name) -> CarriedOver:
+def fit_to_format(rig: Rig, kind: Name) -> CarriedOver:
     """What a format can hold of a rig. Raises OutputError where that is too little."""
     format = FORMATS[kind]
     if format.write is None and kind != "handpiece":
@@ -210,7 +210,9 @@ def carried_over(rig: Rig, kind: Name) -> CarriedOver:
     lenses = {name: convert_lens(mounted.camera, format.lenses) for name, mounted in rig.cameras.items()}
     cameras = {name: replace(mounted, camera=lenses[name][0]) for name, mounted in rig.cameras.items()}
     notes = []
-    if kind != "handpiece" and any(_is_uncertain(each) for each in rig.cameras.values()):
+    if kind != "handpiece" and any(
+        each.covariance is not None or each.camera.covariance is not None for each in rig.cameras.values()
+    ):
         notes.append(f"{format.title} has no place for covariances: they are left out")
     if not format.keeps_names and count > 1:
         notes.append(f"{format.title} numbers cameras: their order is {', '.join(rig.names)}")
@@ -219,10 +221,6 @@ def carried_over(rig: Rig, kind: Name) -> CarriedOver:
         losses={name: loss for name, (_, loss) in lenses.items() if loss is not None},
         notes=tuple(notes),
     )
-
-
-def _is_uncertain(mounted: MountedCamera) -> bool:
-    return mounted.covariance is not None or mounted.camera.covariance is not None
 
 
 def write_calibration(path: Path, rig: Rig, kind: Name, working_distance_mm: float | None = None) -> None:

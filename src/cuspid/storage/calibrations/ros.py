@@ -1,5 +1,5 @@
 """ROS: ``camera_info``, a YAML file for each camera, as ``camera_calibration_parsers`` and ``camera_calibration`` write
-it, or as a message is printed. Pixel centres are whole numbers, lengths metres. The place of a camera is told only for
+it, or as a message is printed. Pixel centres are whole numbers, lengths metres. The pose of a camera is given only for
 rectified pairs: by the rotation R into the rectified frame, and by P, whose last column holds the baseline."""
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def read(files: Mapping[str, Document], hints: Hints) -> Calibration:
     if len(cameras) == 2 and not placed:
         raise InputError("its two cameras have no baseline in projection_matrix; give those of a calibrated pair")
     if len(cameras) > 2:
-        raise InputError(f"{len(cameras)} camera_info files; they tell places of a rectified pair only, so give two")
+        raise InputError(f"{len(cameras)} camera_info files; they give poses of a rectified pair only, so give two")
     if len(cameras) == 2 and placed[0] == next(iter(cameras)):
         cameras = dict(reversed(cameras.items()))
     return Calibration(cameras=cameras)

@@ -59,7 +59,7 @@ class ScanFile:
 
     @property
     def levels(self) -> dict[str, str | None]:
-        """The cells that tell it in tables."""
+        """The cells that identify it in tables."""
         return {
             "scanner": self.scanner,
             "specimen": self.specimen,
@@ -110,8 +110,8 @@ def find_files(given: Path) -> StudyFiles:
 
 
 def without_repeats(files: StudyFiles, digests: Mapping[str, str]) -> StudyFiles:
-    """Without scans whose file is the same as that of an earlier one, by the digests of their files (key to digest):
-    they would feign precision."""
+    """The files without scans that repeat the file of an earlier one, by digest (of each key): duplicates would feign
+    precision."""
     first: dict[str, ScanFile] = {}
     kept, remarks = [], []
     for scan in files.scans:
@@ -147,7 +147,7 @@ def landmark_file(mesh: Path) -> Path | None:
 
 
 def belongings(reference: Path) -> tuple[Path, ...]:
-    """All files that tell what a specimen is, the reference first."""
+    """All files that describe a specimen, the reference first."""
     others = (area_file(reference), body_file(reference), landmark_file(reference))
     tables = (
         find_beside(reference, [ending]) for ending in (".spheres.csv", ".bodies.csv", "_facelabels.npy", ".json")
@@ -172,7 +172,7 @@ def _from_folder(folder: Path) -> StudyFiles:
     for scanner in sorted(path for path in list_finished(folder) if path.is_dir() and path != home):
         for specimen, path in _of_scanner(scanner, references, remarks):
             scans.append(ScanFile(scanner=scanner.name, specimen=specimen, scan=path.stem, path=path))
-    return StudyFiles(scans=_told_apart(scans), references=references, remarks=tuple(remarks))
+    return StudyFiles(scans=_distinguish_names(scans), references=references, remarks=tuple(remarks))
 
 
 def _of_scanner(scanner: Path, references: Mapping[str, Path], remarks: list[Remark]) -> Iterator[tuple[str, Path]]:
@@ -201,7 +201,7 @@ def _goes_along(path: Path) -> bool:
     return path.stem == _COMMON_BODY or path.stem.endswith(_BESIDE)
 
 
-def _told_apart(scans: Sequence[ScanFile]) -> tuple[ScanFile, ...]:
+def _distinguish_names(scans: Sequence[ScanFile]) -> tuple[ScanFile, ...]:
     """Scans of one name, as a.stl and a.ply, get their endings back."""
     keys = [scan.key for scan in scans]
     return tuple(

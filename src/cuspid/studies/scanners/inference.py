@@ -45,7 +45,7 @@ class Estimate:
 
     value: float
     low: float | None
-    """Lower end; None where too few scans tell."""
+    """Lower end; None with too few scans."""
     high: float | None
 
 
@@ -131,7 +131,7 @@ def mean_estimate(groups: Sequence[Float[np.ndarray, "_"]], rng: np.random.Gener
     freedom = sum(len(group) - 1 for group in groups)
     if freedom < _LEAST_SCANS - 1:
         return Estimate(value=value, low=None, high=None)
-    draws = np.mean([_means_of_draws(group, rng) for group in groups], axis=0)
+    draws = np.mean([group[rng.integers(0, len(group), (_DRAWS, len(group)))].mean(axis=1) for group in groups], axis=0)
     size = len(groups) + freedom
     reach = float(stats.t.ppf(0.5 + LEVEL / 2, freedom)) * np.sqrt(size / freedom)
     share = float(stats.norm.cdf(-reach))
@@ -139,15 +139,11 @@ def mean_estimate(groups: Sequence[Float[np.ndarray, "_"]], rng: np.random.Gener
     return Estimate(value=value, low=float(low), high=float(high))
 
 
-def _means_of_draws(group: Float[np.ndarray, "n"], rng: np.random.Generator) -> Float[np.ndarray, "d"]:
-    return group[rng.integers(0, len(group), (_DRAWS, len(group)))].mean(axis=1)
-
-
 def precision_estimate(groups: Sequence[Float[np.ndarray, "_ _"]]) -> Estimate:
     """The mean over specimens of the mean over all pairs; each group is the symmetric matrix of the figure of pairs."""
     means = [_mean_of_pairs(group) for group in groups]
     value = float(np.mean(means))
-    parts = [_left_out(group, means, k) for k, group in enumerate(groups) if len(group) >= _LEAST_SCANS]
+    parts = [_leave_one_out(group, means, k) for k, group in enumerate(groups) if len(group) >= _LEAST_SCANS]
     variances = np.array([(len(part) - 1) / len(part) * np.sum((part - part.mean()) ** 2) for part in parts])
     if len(parts) < len(groups) or not variances.sum() > 0:
         return Estimate(value=value, low=None, high=None)
@@ -160,7 +156,7 @@ def _mean_of_pairs(matrix: Float[np.ndarray, "n n"]) -> float:
     return float(matrix[np.triu_indices(len(matrix), 1)].mean())
 
 
-def _left_out(matrix: Float[np.ndarray, "n n"], means: Sequence[float], which: int) -> Float[np.ndarray, "n"]:
+def _leave_one_out(matrix: Float[np.ndarray, "n n"], means: Sequence[float], which: int) -> Float[np.ndarray, "n"]:
     """Logarithms of the mean over specimens without each scan of one of them."""
     others = sum(means) - means[which]
     keep = [np.delete(np.arange(len(matrix)), k) for k in range(len(matrix))]
@@ -215,7 +211,7 @@ def compare_scanners(
 
 
 def correct_p_values(comparisons: Sequence[Comparison]) -> tuple[Comparison, ...]:
-    """With p corrected for the number of comparisons (Holm)."""
+    """The comparisons with p corrected for their number (Holm)."""
     if not comparisons:
         return ()
     adjusted = holm([each.p for each in comparisons])

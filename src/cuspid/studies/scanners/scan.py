@@ -29,7 +29,7 @@ from cuspid.storage import MM_PER_UNIT
 from cuspid.storage.files import write_arrays
 from cuspid.studies.scanners.files import ScanFile
 from cuspid.studies.scanners.soundness import cut_notes, mend_faces
-from cuspid.studies.scanners.specimen import Specimen, guessed_unit, scan_landmarks
+from cuspid.studies.scanners.specimen import Specimen, guess_unit, scan_landmarks
 
 Region = Literal["all", "crowns", "area"]
 """What is evaluated of what all scans of a specimen show."""
@@ -53,8 +53,8 @@ class StudyOptions(Options):
     """How the scans of a study are compared."""
 
     align: AlignmentKind = "best-fit"
-    """By what scans are aligned: a global best fit; a reference area (--align-teeth, or a mesh beside the reference);
-    the crowns; landmarks; spheres; scan bodies; or not at all, for files that are in one frame."""
+    """How scans are aligned: a global best fit; a reference area (--align-teeth, or a mesh beside the reference); the
+    crowns; landmarks; spheres; scan bodies; or not at all, for files that are in one frame."""
     align_teeth: Annotated[tuple[int, ...], TOOTH] = ()
     """FDI numbers of the teeth that are the reference area."""
     region: Region = "all"
@@ -63,7 +63,7 @@ class StudyOptions(Options):
     """How repeats are compared: each pair, at places of the reference; each pair, mesh to mesh (slower); or each with
     their mean surface."""
     max_distance_mm: Annotated[float, Range(0.01, 100)] = 1.0
-    """Surface farther than this from the other one is not shown by it; its share is told."""
+    """Surface farther than this from the other one is not shown by it; its share is reported."""
     samples: Annotated[int, Range(1000, 5_000_000)] = 60_000
     """Samples on each scan, uniform by area."""
     min_overlap: Annotated[float, SHARE] = 0.6
@@ -91,20 +91,20 @@ class Measured:
     """Signed distance of each sample of the scan from the reference."""
     sample_place: Int[np.ndarray, "s"]
     """The place next to it, or `BEYOND`."""
-    told: Mapping[str, Any]
+    record: Mapping[str, Any]
     """All else, as JSON knows it."""
 
 
 def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> Measured:
     """Read and measure one scan. Raises InputError where it has no part in the study, and says why."""
-    mesh, told = _read(scan, specimen)
+    mesh, record = _read(scan, specimen)
     rough = _register(mesh, specimen, options)
     samples, _ = mesh.sample(options.samples, np.random.default_rng([options.seed, 1]))
     pose, parts, missed = _align(scan, mesh, samples, specimen, rough.reference_from_scan, options)
     aligned = mesh.transformed(pose)
     points = pose.apply(samples)
     against = SignedDistance(aligned)
-    sample_um, sample_place, piece = _onto_reference(points, specimen)
+    sample_um, sample_place, piece = _project_to_reference(points, specimen)
     place_um = deviations_um(specimen.places, against, options.max_distance_mm)
     deformation = _deformation(specimen, against, place_um)
     stations = {**_pieces(points, sample_um, piece, specimen, deformation, options), **parts}
@@ -112,12 +112,12 @@ def measure_file(scan: ScanFile, specimen: Specimen, options: StudyOptions) -> M
         place_um=place_um.astype(np.float32),
         sample_um=sample_um.astype(np.float32),
         sample_place=sample_place.astype(np.int32),
-        told={
-            **told,
+        record={
+            **record,
             "reference_from_scan": pose.matrix,
             "overlap": rough.overlap,
             "similarity_scale_ppm": 1e6 * (rough.scale - 1),
-            "notes": [*told["notes"], *rough.notes, *missed],
+            "notes": [*record["notes"], *rough.notes, *missed],
             "deformation": None if deformation is None else asdict(deformation),
             "spans": [asdict(span) for kind, found in _kinds(stations).items() for span in spans(kind, found)],
             "shifts": [_shift(kind, label, station) for (kind, label), station in stations.items()],
@@ -131,13 +131,13 @@ def write_measured(folder: Path, key: str, measured: Measured, *, made_from: str
     arrays = {name: getattr(measured, name) for name in ("place_um", "sample_um", "sample_place")}
     write_arrays(folder / f"{key}.npz", arrays)
     storage.write_json(
-        folder / f"{key}.json", {"made_from": made_from, "sha256": sha256, "failure": None, **measured.told}
+        folder / f"{key}.json", {"made_from": made_from, "sha256": sha256, "failure": None, **measured.record}
     )
 
 
 def _read(scan: ScanFile, specimen: Specimen) -> tuple[Mesh, dict[str, Any]]:
     read = storage.read_mesh(scan.path)
-    unit, odd = guessed_unit(scan.path, read, like_mm=specimen.width_mm)
+    unit, odd = guess_unit(scan.path, read, like_mm=specimen.width_mm)
     mesh, mending = mend_faces(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     # From here on in the frame that the reference was turned into: without an alignment both stay together.
     return mesh.transformed(specimen.occlusal_from_file), {
@@ -155,7 +155,9 @@ def _register(mesh: Mesh, specimen: Specimen, options: StudyOptions) -> Alignmen
         scale = best_scale(points, surface, Rigid3.identity(), options.registration)
         near = np.abs(surface.closest_points(points).signed_mm) < options.registration.outlier_mm
         return Alignment(reference_from_scan=Rigid3.identity(), scale=scale, rms_um=0.0, overlap=float(near.mean()))
-    found = _found_fast(mesh, surface, options.registration) or register(mesh, surface, options.registration, rng=rng)
+    found = _align_quickly(mesh, surface, options.registration) or register(
+        mesh, surface, options.registration, rng=rng
+    )
     if found.mirrored:
         raise InputError("a mirror image of the reference; mirror it back, or give the reference of its own specimen")
     if found.overlap < options.min_overlap:
@@ -166,7 +168,7 @@ def _register(mesh: Mesh, specimen: Specimen, options: StudyOptions) -> Alignmen
     return found
 
 
-def _found_fast(mesh: Mesh, surface: SignedDistance, options: RegistrationOptions) -> Alignment | None:
+def _align_quickly(mesh: Mesh, surface: SignedDistance, options: RegistrationOptions) -> Alignment | None:
     """An alignment by few poses, where nothing about it is in doubt."""
     given = options.search
     search = replace(given, **{name: min(getattr(given, name), most) for name, most in _FEW_POSES.items()})
@@ -235,7 +237,7 @@ def _parts(
         for label, sphere in report.spheres.items():
             found["spheres", label] = _point(specimen.spheres[label].centre, sphere.centre)
         missed += [f"sphere {label}: {reason}" for label, reason in report.not_measured.items()]
-    for label, body in _found_bodies(mesh, specimen, rough, options, missed).items():
+    for label, body in _fit_bodies(mesh, specimen, rough, options, missed).items():
         nominal = specimen.bodies[label]
         found["bodies", label] = Station(nominal=nominal, measured=body.scan_from_body, axis=(0.0, 0.0, 1.0))
     return found, missed
@@ -246,7 +248,7 @@ def _given_landmarks(scan: ScanFile, specimen: Specimen) -> dict[str, Float[np.n
     return {label: specimen.occlusal_from_file.apply(position) for label, position in given.items()}
 
 
-def _found_bodies(
+def _fit_bodies(
     mesh: Mesh, specimen: Specimen, rough: Rigid3, options: StudyOptions, missed: list[str]
 ) -> dict[str, BodyFit]:
     found: dict[str, BodyFit] = {}
@@ -269,7 +271,7 @@ def _point(nominal: Float[np.ndarray, "3"], measured: Float[np.ndarray, "3"]) ->
     return Station(nominal=Rigid3(np.eye(3), nominal), measured=Rigid3(np.eye(3), measured), has_axes=False)
 
 
-def _onto_reference(
+def _project_to_reference(
     points: Float[np.ndarray, "s 3"], specimen: Specimen
 ) -> tuple[Float[np.ndarray, "s"], Int[np.ndarray, "s"], Int[np.ndarray, "s"]]:
     """Signed distances of samples (um), the place next to each, and the piece that it is on."""
@@ -303,12 +305,12 @@ def _pieces(
     )
     kind = "teeth" if specimen.labelled else "stations"
     return {
-        (kind, specimen.piece_name(each)): _as_station(tooth, places[each], specimen, deformation)
+        (kind, specimen.piece_name(each)): _station_of(tooth, places[each], specimen, deformation)
         for each, tooth in found.items()
     }
 
 
-def _as_station(
+def _station_of(
     tooth: ScannedTooth, places: Float[np.ndarray, "n 3"], specimen: Specimen, deformation: Deformation | None
 ) -> Station:
     """Where a part lies in the scan: its own motion first, then what the modes do to it there."""

@@ -1,7 +1,8 @@
 """What is odd about the triangles of a mesh, whatever it shows: faces that are there twice, a surface that cuts itself.
 
 Files of two objects in one, or of a surface with both of its sides, hold each face twice: borders would not be found,
-and normals cancel. One of each is used. A surface that cuts itself is left as it is: no one can tell which sheet holds.
+and normals cancel. One of each is used. A surface that cuts itself is left as it is: nothing shows which sheet is
+right.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def cut_notes(mesh: Mesh) -> tuple[str, ...]:
 
 
 def count_cuts(mesh: Mesh) -> int:
-    """At how many places edges of the surface pass through other faces of it, by rays along them (Embree)."""
+    """Number of places where edges of the surface pass through other faces of it, by rays along them (Embree)."""
     one, other = _cuts(mesh)
     if not len(one):
         return 0

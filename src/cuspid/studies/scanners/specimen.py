@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from cuspid import storage
 from cuspid.anatomy.crowns import crowns_of
-from cuspid.anatomy.jaw_files import Labelling, named_arch
+from cuspid.anatomy.jaw_files import Labelling, arch_from_name
 from cuspid.anatomy.orientation import find_occlusal_frame
 from cuspid.anatomy.surfaces import SURFACES, named_surfaces
 from cuspid.evaluation.distance import SignedDistance
@@ -143,7 +143,7 @@ class Specimen:
         return tuple(piece for piece in order if piece in there)
 
 
-def guessed_unit(path: Path, mesh: Mesh, like_mm: float | None = None) -> tuple[Unit, str | None]:
+def guess_unit(path: Path, mesh: Mesh, like_mm: float | None = None) -> tuple[Unit, str | None]:
     """The unit of a file whose mesh was read in mm, by its size, which is that of teeth or jaws, or nearly ``like_mm``
     where that is known; and what is odd about it. Raises InputError where no unit fits."""
     file = MeasuredFile(path=path, mesh=mesh, unit="mm")
@@ -172,19 +172,19 @@ def load_specimen(
     align_teeth: tuple[int, ...] = (),
 ) -> Specimen:
     """The reference of a specimen and what lies beside it. Raises InputError where it cannot be used."""
-    read_in, odd = (unit, None) if unit is not None else guessed_unit(path, storage.read_mesh(path))
+    read_in, odd = (unit, None) if unit is not None else guess_unit(path, storage.read_mesh(path))
     jaw, occlusal_from_file, notes = _load_reference(path, read_in, arch, labelling)
     mesh, mm = jaw.mesh, MM_PER_UNIT[read_in]
     area = _area_of(path, jaw, occlusal_from_file, read_in, align_teeth)
     places = scatter(mesh, PLACES, np.random.default_rng(0))
     crowns = crowns_of(jaw)
-    curve, told = _curve_of(jaw)
+    curve, note = _curve_of(jaw)
     labels = np.zeros(len(mesh.faces), dtype=np.int64) if jaw.face_labels is None else np.asarray(jaw.face_labels)
     labelled = bool(np.unique(labels[labels != GUM]).size > 1)
     crown = crowns.faces[places.faces]
     at = _length_along(curve, places.points)
     body, bodies, missed = _bodies_of(path, mesh, occlusal_from_file, mm)
-    notes = (*notes, *told, *missed) if odd is None else (odd, *notes, *told, *missed)
+    notes = (*notes, *note, *missed) if odd is None else (odd, *notes, *note, *missed)
     return Specimen(
         name=name,
         mesh=mesh,
@@ -233,7 +233,7 @@ def _load_reference(
     occlusal = find_occlusal_frame(mesh)
     upright = mesh.transformed(occlusal.occlusal_from_mesh)
     notes = (*doubled, *facing, *cut_notes(mesh), *occlusal.notes)
-    arch = arch or named_arch(path)
+    arch = arch or arch_from_name(path)
     if labels is not None:
         try:
             numbered = labelling.fdi(path, labels, upright, arch=arch, sure=not occlusal.notes)
@@ -342,7 +342,7 @@ def _bodies_of(
     if table is None or library is None:
         return None, {}, ()
     read = storage.read_mesh(library)
-    unit, _ = guessed_unit(library, read, like_mm=8.0)
+    unit, _ = guess_unit(library, read, like_mm=8.0)
     body, _ = mend_faces(Mesh(read.vertices * MM_PER_UNIT[unit], read.faces))
     surface = SignedDistance(body)
     found, notes = {}, []
@@ -417,23 +417,23 @@ def write_specimen(folder: Path, specimen: Specimen) -> None:
 def read_specimen(folder: Path) -> Specimen:
     """What :func:`write_specimen` wrote. Raises InputError where it is damaged."""
     arrays = read_arrays(folder / "specimen.npz", remedy=_REMEDY)
-    told: dict[str, Any] = storage.read_json(folder / "specimen.json")
+    record: dict[str, Any] = storage.read_json(folder / "specimen.json")
     with storage.reading(folder / "specimen.json"):
         body = Mesh(arrays["body_vertices"], arrays["body_faces"]) if len(arrays["body_faces"]) else None
         return Specimen(
-            name=told["name"],
+            name=record["name"],
             mesh=Mesh(arrays["vertices"], arrays["faces"]),
-            occlusal_from_file=Rigid3.from_matrix(np.array(told["occlusal_from_file"])),
+            occlusal_from_file=Rigid3.from_matrix(np.array(record["occlusal_from_file"])),
             places=Places(points=arrays["place_points"], normals=arrays["place_normals"], faces=arrays["place_faces"]),
             **{name: arrays[name] for name in _ARRAYS},
             spheres={
                 label: Sphere(centre=np.array(each["centre"]), radius_mm=each["radius_mm"])
-                for label, each in told["spheres"].items()
+                for label, each in record["spheres"].items()
             },
-            bodies={label: Rigid3.from_matrix(np.array(matrix)) for label, matrix in told["bodies"].items()},
+            bodies={label: Rigid3.from_matrix(np.array(matrix)) for label, matrix in record["bodies"].items()},
             body=body,
-            landmarks={label: np.array(position) for label, position in told["landmarks"].items()},
-            labelled=told["labelled"],
-            arch=told["arch"],
-            notes=tuple(told["notes"]),
+            landmarks={label: np.array(position) for label, position in record["landmarks"].items()},
+            labelled=record["labelled"],
+            arch=record["arch"],
+            notes=tuple(record["notes"]),
         )

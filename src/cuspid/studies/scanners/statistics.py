@@ -1,4 +1,4 @@
-"""From the tables of a study to what is said of its scanners."""
+"""Derives the statements about scanners from the tables of a study."""
 
 from __future__ import annotations
 

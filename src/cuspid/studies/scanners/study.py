@@ -38,7 +38,7 @@ class Intake:
     """How the references are read."""
 
     unit: storage.Unit | None = None
-    """Their length unit; told by their size unless given. That of each scan is told by its reference."""
+    """Their length unit; inferred from their size unless given. That of each scan is inferred from its reference."""
     arch: Arch | None = None
     """Which jaw they show, if their teeth are to be numbered."""
     labelling: Labelling = field(default_factory=Labelling)
@@ -66,7 +66,7 @@ class Prepared:
     files: StudyFiles
     scans: tuple[ScanFile, ...]
     remarks: tuple[Remark, ...]
-    told: Mapping[str, Mapping[str, Any]]
+    records: Mapping[str, Mapping[str, Any]]
     """What is kept of each of these scans, by its key."""
 
 
@@ -94,24 +94,24 @@ def prepare(
     )
     files = without_repeats(readable, digests)
     made, lost = _specimens(files, out, options, intake, progress)
-    wanted = [scan for scan in files.scans if scan.specimen in made]
-    if not wanted:
+    chosen = [scan for scan in files.scans if scan.specimen in made]
+    if not chosen:
         raise InputError(f"{given}: no specimen can be used: {'; '.join(map(str, lost[:3]))}")
-    keys = {scan.key: _made_from(scan, digests, made, options) for scan in wanted}
-    _measure(wanted, keys, out, options, workers, cluster, retry_failed, progress)
-    told = {scan.key: storage.read_json(_record(out, scan.key)) for scan in wanted}
+    keys = {scan.key: _provenance_of(scan, digests, made, options) for scan in chosen}
+    _measure(chosen, keys, out, options, workers, cluster, retry_failed, progress)
+    records = {scan.key: storage.read_json(_record(out, scan.key)) for scan in chosen}
     failed = [
-        Remark(what=scan.name, why=f"{told[scan.key]['failure']}; left out", left_out=True)
-        for scan in wanted
-        if told[scan.key]["failure"] is not None
+        Remark(what=scan.name, why=f"{records[scan.key]['failure']}; left out", left_out=True)
+        for scan in chosen
+        if records[scan.key]["failure"] is not None
     ]
-    good = tuple(scan for scan in wanted if told[scan.key]["failure"] is None)
-    odd = [Remark(what=scan.name, why=note) for scan in good for note in told[scan.key]["notes"]]
+    good = tuple(scan for scan in chosen if records[scan.key]["failure"] is None)
+    odd = [Remark(what=scan.name, why=note) for scan in good for note in records[scan.key]["notes"]]
     return Prepared(
         files=files,
         scans=good,
         remarks=(*files.remarks, *lost, *failed, *odd),
-        told={scan.key: told[scan.key] for scan in good},
+        records={scan.key: records[scan.key] for scan in good},
     )
 
 
@@ -142,7 +142,7 @@ def compare(prepared: Prepared, out: Path, options: StudyOptions, progress: Prog
     )
 
 
-def foreseen(prepared: Prepared, out: Path, options: StudyOptions) -> tuple[Remark, ...]:
+def plan_comparison(prepared: Prepared, out: Path, options: StudyOptions) -> tuple[Remark, ...]:
     """All that is odd about scans that were prepared, before they are compared."""
     found = coverage_remarks(partial(specimen_of, out), prepared.scans, out / "scans", options)
     return (*prepared.remarks, *found)
@@ -225,7 +225,7 @@ def _record(out: Path, key: str) -> Path:
     return out / "scans" / f"{key}.json"
 
 
-def _made_from(
+def _provenance_of(
     scan: ScanFile, digests: Mapping[str, str], specimens: Mapping[str, str], options: StudyOptions
 ) -> tuple[str, str]:
     """The digest of a scan's file, and what identifies what is kept of it."""
@@ -242,16 +242,16 @@ def _is_done(out: Path, key: str, made_from: str, retry_failed: bool) -> bool:
     if not path.exists():
         return False
     try:
-        told = storage.read_json(path)
+        record = storage.read_json(path)
     except InputError:  # damaged: it is made again
         return False
-    if told.get("made_from") != made_from or (told["failure"] is not None and retry_failed):
+    if record.get("made_from") != made_from or (record["failure"] is not None and retry_failed):
         return False
-    return told["failure"] is not None or (out / "scans" / f"{key}.npz").exists()
+    return record["failure"] is not None or (out / "scans" / f"{key}.npz").exists()
 
 
 def _measure(
-    wanted: Sequence[ScanFile],
+    scans: Sequence[ScanFile],
     keys: Mapping[str, tuple[str, str]],
     out: Path,
     options: StudyOptions,
@@ -260,7 +260,7 @@ def _measure(
     retry_failed: bool,
     progress: Progress,
 ) -> None:
-    left = [scan for scan in wanted if not _is_done(out, scan.key, keys[scan.key][1], retry_failed)]
+    left = [scan for scan in scans if not _is_done(out, scan.key, keys[scan.key][1], retry_failed)]
     listed = {
         scan.key: {
             **vars(scan),
@@ -317,15 +317,11 @@ def measure_share(*, keys: str, out: Path, options: StudyOptions) -> dict[str, V
             write_measured(out / "scans", key, measured, made_from=entry["made_from"], sha256=entry["digest"])
         except CuspidError as error:
             failed += 1
-            _fail(out, key, entry["made_from"], _without_path(str(error), scan.path))
+            _fail(out, key, entry["made_from"], str(error).removeprefix(f"{scan.path}: "))
         except Exception as error:  # one broken scan must not end the others of its share
             failed += 1
             _fail(out, key, entry["made_from"], f"{type(error).__name__}: {error}".splitlines()[0])
     return {"scans": len(keys.split()), "failed": failed}
-
-
-def _without_path(message: str, path: Path) -> str:
-    return message.removeprefix(f"{path}: ")
 
 
 def _fail(out: Path, key: str, made_from: str, reason: str) -> None:

@@ -1,7 +1,7 @@
 """The scans of a study beside each other: what all of a specimen show, figures of each scan, and precision.
 
 Scans are read one by one from what :mod:`cuspid.studies.scanners.scan` kept of them; of a group of repeats, the
-deviations at the places of the reference are held at once.
+deviations at the places of the reference are in memory at once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cuspid.studies.scanners.soundness import mend_faces
 from cuspid.studies.scanners.specimen import SEGMENTS, Specimen
 
 WITHIN_UM = (10, 25, 50, 100)
-"""Distances within which the share of the surface is told."""
+"""Distances within which the share of the surface is reported."""
 _LEAST_SAMPLES = 50
 """Of a region, for figures."""
 _INTERPROXIMAL = ("mesial", "distal")
@@ -90,7 +90,7 @@ def read_measured(folder: Path, key: str) -> Measured:
         place_um=arrays["place_um"].astype(np.float64),
         sample_um=arrays["sample_um"].astype(np.float64),
         sample_place=arrays["sample_place"].astype(np.int64),
-        told=storage.read_json(folder / f"{key}.json"),
+        record=storage.read_json(folder / f"{key}.json"),
     )
 
 
@@ -163,7 +163,7 @@ class Compared:
     scan: ScanFile
     measured: Measured
     motion: SmallMotion | None
-    """By what the alignment was corrected; None where it is not one of the whole surface."""
+    """Correction of the alignment; None where it is not one of the whole surface."""
     place_um: Float[np.ndarray, "p"]
     """Deviation at each place; NaN where it is not shown."""
     sample_um: Float[np.ndarray, "s"]
@@ -175,7 +175,7 @@ class Compared:
 
 
 def compare_scan(scan: ScanFile, folder: Path, specimen: Specimen, common: Common, options: StudyOptions) -> Compared:
-    """Read a scan and align it finally: a best fit is made anew, to the places that all scans show, so that gum and
+    """Read a scan and align it finally: a best fit is repeated with the places that all scans show, so that gum and
     borders of one scan do not move it."""
     measured = read_measured(folder, scan.key)
     motion = None
@@ -211,12 +211,12 @@ def figures(signed_um: Float[np.ndarray, "n"]) -> Row:
 
 def scan_row(found: Compared, common: Common) -> Row:
     """The row of a scan."""
-    told = found.measured.told
+    record = found.measured.record
     shown = found.place_um[common.places]
     asked = found.place_um[common.asked]
     back = {f"back_{name}": value for name, value in figures(shown[np.isfinite(shown)]).items()}
-    spans_um = np.array([span["error_um"] for span in told["spans"]])
-    nominal_mm = np.array([span["nominal_mm"] for span in told["spans"]])
+    spans_um = np.array([span["error_um"] for span in record["spans"]])
+    nominal_mm = np.array([span["nominal_mm"] for span in record["spans"]])
     return {
         **found.scan.levels,
         **figures(found.sample_um),
@@ -227,14 +227,14 @@ def scan_row(found: Compared, common: Common) -> Row:
             for um in WITHIN_UM
         },
         "far_pct": found.far_pct,
-        "similarity_scale_ppm": told["similarity_scale_ppm"],
-        **_modes(told["deformation"]),
+        "similarity_scale_ppm": record["similarity_scale_ppm"],
+        **_modes(record["deformation"]),
         "spans_rms_um": float(np.sqrt(np.mean(spans_um**2))) if len(spans_um) else None,
         "spans_ppm": float(1000 * nominal_mm @ spans_um / (nominal_mm @ nominal_mm)) if len(spans_um) else None,
-        "faces": told["faces"],
-        "unit": told["unit"],
+        "faces": record["faces"],
+        "unit": record["unit"],
         "file": str(found.scan.path),
-        "sha256": told["sha256"],
+        "sha256": record["sha256"],
     }
 
 
@@ -359,17 +359,17 @@ def _mesh_to_mesh(one: Compared, other: Compared, specimen: Specimen, options: S
 
 
 def _aligned_mesh(each: Compared, specimen: Specimen) -> Mesh:
-    unit = each.measured.told["unit"]
+    unit = each.measured.record["unit"]
     mesh, _ = mend_faces(storage.read_mesh(each.scan.path, unit))
-    pose = Rigid3.from_matrix(np.array(each.measured.told["reference_from_scan"])) @ specimen.occlusal_from_file
+    pose = Rigid3.from_matrix(np.array(each.measured.record["reference_from_scan"])) @ specimen.occlusal_from_file
     return mesh.transformed(pose if each.motion is None else each.motion.rigid @ pose)
 
 
 def spread_from_mean_um(
     group: Sequence[Compared], common: Common, places: Places, *, align: bool
 ) -> list[float | None]:
-    """Of each scan, the root mean square of its differences from the mean of its group, times sqrt(n / (n - 1)), as
-    the mean contains the scan: what Levene's test compares."""
+    """The root mean square of the differences of each scan from the mean of its group, times sqrt(n / (n - 1)), as the
+    mean contains the scan: what Levene's test compares."""
     count = len(group)
     if count < 2:
         return [None]
@@ -461,6 +461,6 @@ def _add_group(
     for each in group:
         levels = each.scan.levels
         tables.regions.extend(region_rows(each, specimen))
-        tables.spans.extend({**levels, **span} for span in each.measured.told["spans"])
-        tables.shifts.extend({**levels, **shift} for shift in each.measured.told["shifts"])
+        tables.spans.extend({**levels, **span} for span in each.measured.record["spans"])
+        tables.shifts.extend({**levels, **shift} for shift in each.measured.record["shifts"])
     keep_group(mean, specimen)
