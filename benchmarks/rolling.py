@@ -1,14 +1,15 @@
 """Rolling shutters and delays: in calibrations from simulated films and from real webcams, and in scans.
 
-    python benchmarks/rolling.py [FOLDER] [--seeds 12] [--sets webcams] [--work FOLDER]
-                                 [--out benchmarks/results/rolling.json]
+    python benchmarks/rolling.py [FOLDER] [--seeds 12] [--sets webcams] [--films CASE ...] [--add]
+                                 [--work FOLDER] [--out benchmarks/results/rolling.json]
 
-Cameras film a board that a hand moves, each with a readout of its own (``simulated``): the errors of the readouts and
-lenses in what is stated, and those of the lenses if the readouts are ignored. The same with webcams (``FOLDER``,
-with ``caliscope/``): residuals in held-out images without and with readouts. The molar 46 of the phantom is scanned by
-twelve cameras (``scans``) with global shutters, and with rolling ones that are known, ignored or unknown, together and
-delayed. Finished scans are kept in the work folder, and what the same code has measured in the file of results; neither
-is made again.
+Cameras film a board that a hand moves, each with a readout of its own (``simulated``): the errors of the readouts,
+delays and lenses in what is stated, and those of the lenses if the readouts are ignored. The same with webcams
+(``FOLDER``, with ``caliscope/``): residuals in held-out images without and with readouts. The molar 46 of the phantom
+is scanned by twelve cameras (``scans``) with global shutters, and with rolling ones that are known, ignored or unknown,
+together and delayed. Finished scans are kept in the work folder, and what the same code has measured in the file of
+results; neither is made again. ``--add`` keeps what older code has measured, too: the commit of the file stays that of
+these, and films have one of their own.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ class Film:
     cameras: int
     rolls: bool = True
     """Whether they have readouts, which take turns from seed to seed."""
-    late: float = 0.0
-    """By how many frames the second one is late."""
+    delays: tuple[float, ...] = ()
+    """By how many frames each is late; none of them without."""
     share: float = 1.0
     """Of the seeds that are tried."""
 
@@ -65,12 +66,18 @@ class Film:
         """Of each camera."""
         return {f"cam{k}": self.rolls * READOUTS[(k + seed) % len(READOUTS)] for k in range(self.cameras)}
 
+    @property
+    def late(self) -> dict[str, float]:
+        """By how many frames each camera is late."""
+        return {f"cam{k}": delay for k, delay in enumerate(self.delays)}
+
 
 FILMS = {
     "one camera": Film(cameras=1),
     "one camera, global": Film(cameras=1, rolls=False),
     "three cameras": Film(cameras=3, share=0.25),
-    "three cameras, one late": Film(cameras=3, late=0.4, share=0.25),
+    "three cameras, one late": Film(cameras=3, delays=(0.0, 0.4, 0.0), share=0.25),
+    "three cameras, all apart": Film(cameras=3, delays=(0.0, 0.4, -0.3), share=0.5),
 }
 UNKNOWN = 0.5
 """Standard deviation of a readout of which nothing is known."""
@@ -140,17 +147,20 @@ def film_figures(case: str, seed: int) -> dict[str, Value]:
     ignored."""
     rng, film = np.random.default_rng(2000 + seed), FILMS[case]
     truth, readouts = rig_before_board(rng, film.cameras), film.readouts(seed)
-    views = filmed(truth, hand(rng), readouts, {"cam1": film.late}, rng)
+    views = filmed(truth, hand(rng), readouts, film.late, rng)
     sizes = dict.fromkeys(truth.cameras, SIZE)
     found = calibrate_rig(views, sizes, BOARD, CalibrationOptions(lens="OPENCV"))
     ignored = calibrate_rig(views, sizes, BOARD, CalibrationOptions(lens="OPENCV", shutter="global"))
     shutters = {name: found.rig[name].shutter for name in readouts}
     kept = any(shutter.readout_sigma for shutter in shutters.values())
     errors = {name: shutter.readout - readouts[name] for name, shutter in shutters.items()}
+    late = _delay_errors(found, film.late)
     return {
         "taken_as_rolling": kept,
         "readout_z": rms([errors[name] / shutters[name].readout_sigma for name in errors]) if kept else None,
         "readout_error": rms(list(errors.values())),
+        "delay_error": rms([error for error, _ in late]) if late else None,
+        "delay_z": rms([error / sigma for error, sigma in late]) if late else None,
         "readout_mean_error": float(np.mean(list(errors.values()))),
         "lens_z": rms([lens_z(found, truth, name) for name in readouts]),
         "focal_error_permille": _focal_error_permille(found, truth),
@@ -161,9 +171,21 @@ def film_figures(case: str, seed: int) -> dict[str, Value]:
     }
 
 
+def _delay_errors(found: RigCalibration, late: Mapping[str, float]) -> list[tuple[float, float]]:
+    """Of each camera, by how many frames its delay is off, and the standard deviation of that: of the mean over its
+    views, which scatter as is stated. None where no camera is late, or that is not found."""
+    usual = float(np.mean([*late.values()] or [0.0]))
+    checks = {name: found.cameras[name] for name in late}
+    return [
+        (check.delay_frames - (late[name] - usual), check.delay_spread_frames / np.sqrt(check.views))
+        for name, check in checks.items()
+        if check.delay_frames is not None and check.delay_spread_frames
+    ]
+
+
 def films_figures(case: str, seeds: int) -> list[dict[str, Value]]:
-    """Of several seeds."""
-    return [film_figures(case, seed) for seed in range(seeds)]
+    """Of several seeds, with the commit that they were measured at."""
+    return [{**film_figures(case, seed), "commit": commit()} for seed in range(seeds)]
 
 
 def _focal_error_permille(found: RigCalibration, truth: BoardScene) -> float:
@@ -237,37 +259,44 @@ def asked() -> argparse.Namespace:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--sets", nargs="*", default=["webcams"])
+    parser.add_argument("--films", nargs="*", default=list(FILMS))
+    parser.add_argument("--add", action="store_true")
     parser.add_argument("--scans", nargs="*", default=list(SCANS))
     parser.add_argument("--work", type=Path, default=Path("build/rolling"))
     parser.add_argument("--out", type=Path, default=HERE / "results" / "rolling.json")
     return parser.parse_args()
 
 
-def kept(path: Path) -> dict[str, dict[str, object]]:
-    """What was measured by the same code before."""
+PARTS = ("simulated", "real", "scans")
+
+
+def kept(path: Path, *, add: bool) -> tuple[dict[str, dict[str, object]], dict[str, object]]:
+    """What was measured by the same code before, or by any if more is added to it, and under which conditions."""
     before = read_json(path) if path.exists() else {}
     same = before.get("commit") == commit()
-    return {part: before[part] if same else {} for part in ("simulated", "real", "scans")}
+    figures = {part: before[part] if same or (add and before) else {} for part in PARTS}
+    under = {key: each for key, each in before.items() if key not in (*PARTS, "noise_px", "readouts")}
+    return figures, under if add and before else conditions()
 
 
 def main() -> None:
     """Measure what is asked for and write the figures."""
     arguments = asked()
-    figures = kept(arguments.out)
+    figures, under = kept(arguments.out, add=arguments.add)
 
     def keep(part: str, name: str, measure: Callable[[], object]) -> None:
         if name in figures[part]:
             return
         figures[part][name] = measure()
         print(name, figures[part][name], flush=True)
-        write_json(arguments.out, {"noise_px": NOISE_PX, "readouts": READOUTS, **figures, **conditions()})
+        write_json(arguments.out, {"noise_px": NOISE_PX, "readouts": READOUTS, **figures, **under})
 
     for name in arguments.sets if arguments.folder else ():
         keep("real", name, partial(real_figures, name, arguments.folder))
     for name in arguments.scans:
         keep("scans", name, partial(scan_figures, name, arguments.work))
-    for case, film in FILMS.items() if arguments.seeds else ():
-        keep("simulated", case, partial(films_figures, case, round(film.share * arguments.seeds)))
+    for case in arguments.films if arguments.seeds else ():
+        keep("simulated", case, partial(films_figures, case, round(FILMS[case].share * arguments.seeds)))
 
 
 if __name__ == "__main__":

@@ -317,11 +317,12 @@ def rolling(result: Result) -> str:
     """Rolling shutters and delays, in calibrations and in scans."""
     films = [
         (
-            name,
+            _film_of(name, runs, result["commit"]),
             len(runs),
             f"{sum(run['taken_as_rolling'] for run in runs)} of {len(runs)}",
             f"{_rms([run['readout_error'] for run in runs]):.4f}",
             _z_of([run["readout_z"] for run in runs]),
+            _delays_of(runs),
             mark_z(_rms([run["lens_z"] for run in runs])),
             f"{_rms([run['focal_error_permille'] for run in runs]):.2f}",
             f"{_rms([run['ignored_lens_z'] for run in runs]):.1f}",
@@ -346,9 +347,9 @@ def rolling(result: Result) -> str:
     return "\n".join(
         [
             f"Cameras film a board that a hand moves over 28 frames ({result['noise_px']} px of noise; readouts "
-            f"{readouts} of the time between frames; *late*: one exposes 0.4 frames after the others; *global*: "
-            "readouts of 0). Errors are root mean squares, in stated standard deviations where it says so (bar: 0.8 to "
-            "1.2):",
+            f"{readouts} of the time between frames; *late*: one exposes 0.4 frames after the others; *all apart*: "
+            "one 0.4 frames after the first, another 0.3 before it; *global*: readouts of 0). Errors are root mean "
+            "squares, in stated standard deviations where it says so (bar: 0.8 to 1.2):",
             "",
             markdown_table(
                 (
@@ -357,6 +358,7 @@ def rolling(result: Result) -> str:
                     "taken as rolling",
                     "readout error, frames",
                     "in sigmas",
+                    "delay error, frames (in sigmas of the mean)",
                     "lens in sigmas",
                     "focal error, per mille",
                     "lens in sigmas, readouts ignored",
@@ -402,6 +404,17 @@ def rolling(result: Result) -> str:
             "`python benchmarks/rolling.py FOLDER`.",
         ]
     )
+
+
+def _film_of(name: str, runs: list[Result], commit: str) -> str:
+    """The name of a film, with the commit that it was measured at where that is another than the others'."""
+    own = runs[0].get("commit", commit)
+    return name if own == commit else f"{name} (commit {own})"
+
+
+def _delays_of(runs: list[Result]) -> str:
+    told = [(run["delay_error"], run["delay_z"]) for run in runs if run.get("delay_error") is not None]
+    return " ".join((f"{_rms([e for e, _ in told]):.4f}", f"({_rms([z for _, z in told]):.1f})")) if told else ""
 
 
 def _z_of(values: list[float | None]) -> str:

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from boards import BOARD, moving, scene, views_of
 from cuspid.calibration.agreement import consensus_motion, disagreement_between, started_later
-from cuspid.calibration.calibrate import _misnumbered
+from cuspid.calibration.bundle import BoardScene, Timing
+from cuspid.calibration.calibrate import _delays, _misnumbered
+from cuspid.calibration.corners import BoardView
 from cuspid.calibration.joining import join_boards
 from cuspid.calibration.start import join_cameras
 from cuspid.geometry import Rigid3
@@ -100,3 +102,23 @@ def test_cameras_before_several_boards_are_told_too() -> None:
 )
 def test_delays_of_whole_frames_are_wrong_numbers(delays: dict[str, float], told: list[str]) -> None:
     assert list(_misnumbered(delays)) == told
+
+
+def test_delays_do_not_depend_on_which_cameras_missed_the_board() -> None:
+    """Of cameras that are late by known times, each view a little off."""
+    rng, late = np.random.default_rng(0), {"a": -0.1, "b": 0.5, "c": -0.4}
+    view = BoardView(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+    keys = [(name, f"{k:02d}") for name in late for k in range(40) if name != "b" or k % 3]
+    drift = {key: 0.3 * int(key[1]) + rng.normal(0, 0.01) for key in keys}
+    timing = Timing(frame={}, near={}, by_camera=late, by_view=drift)
+    scene = BoardScene(
+        cameras=dict.fromkeys(late, moving(0).cameras["cam0"]),
+        cam_from_rig=dict.fromkeys(late, Rigid3.identity()),
+        rig_from_board={},
+        bending_mm=np.zeros(3),
+        timing=timing,
+    )
+    found = _delays(scene, dict.fromkeys(keys, view))
+    for name, delay in late.items():
+        assert found[name][0] == pytest.approx(delay, abs=0.006)
+        assert 0.004 < found[name][1] < 0.012

@@ -113,7 +113,7 @@ class CameraCheck:
     """Difference between the parameters and those from its own views alone, in the standard deviations that the latter
     state; below 1 if these are right; None if there were too few views."""
     delay_frames: float | None
-    """How many frames after the others it saw the board, in the mean; None if all cameras exposed together."""
+    """How many frames after the mean of all cameras it saw the board; None if all exposed together."""
     delay_spread_frames: float | None
     """Standard deviation of that over its views."""
     readout: float | None = None
@@ -567,19 +567,24 @@ def _describe(
 
 
 def _delays(scene: BoardScene, views: Views) -> dict[str, tuple[float, float] | tuple[None, None]]:
-    """Of each camera, how many frames after the mean of those that saw the board with it it exposed, and the standard
-    deviation of that."""
+    """Of each camera, how many frames after the mean of all it exposed, and the standard deviation of that over its
+    views. Where cameras missed the board, by least squares: those that saw it may be the late ones."""
     if scene.timing is None or scene.timing.together:
         return dict.fromkeys(scene.cameras, (None, None))
-    seen = {instant: [camera for camera, at in views if at == instant] for _, instant in views}
-    late: dict[str, list[float]] = {name: [] for name in scene.cameras}
-    for instant, cameras in seen.items():
-        if len(cameras) == 1:  # nothing to compare with
-            continue
-        delays = [scene.timing.delay(camera, instant) for camera in cameras]
-        for camera, delay in zip(cameras, delays, strict=True):
-            late[camera].append(delay - float(np.mean(delays)))
-    return {name: (float(np.mean(each)), float(np.std(each))) for name, each in late.items()}
+    times, names = Counter(instant for _, instant in views), list(scene.cameras)
+    shared = [key for key in views if times[key[1]] > 1]  # alone there is nothing to compare with
+    instants = list(dict.fromkeys(instant for _, instant in shared))
+    design = np.zeros((len(shared) + 1, len(names) + len(instants)))
+    design[-1, : len(names)] = 1.0  # the delays have a mean of 0
+    for row, (camera, instant) in enumerate(shared):
+        design[row, [names.index(camera), len(names) + instants.index(instant)]] = 1.0
+    delays = np.array([scene.timing.delay(*key) for key in shared] + [0.0])
+    found = np.linalg.lstsq(design, delays, rcond=None)[0]
+    left = (delays - design @ found)[:-1]
+    own = {name: left[[camera == name for camera, _ in shared]] for name in names}
+    return {
+        name: (float(found[k]), float(np.std(own[name])) if len(own[name]) else 0.0) for k, name in enumerate(names)
+    }
 
 
 def _calibrate_from_own_views(name: str, found: Adjusted, views: Views, board: Target) -> Adjusted:

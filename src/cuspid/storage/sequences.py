@@ -27,7 +27,8 @@ MOST_FRAMES = 300
 """A longer video is thinned evenly to about as many frames."""
 
 _UNUSED_SHUTTER = (
-    "shutter: the readout of the handpiece's file is not taken into account: one camera alone is located without it"
+    "shutter: the readout of the handpiece's file is not taken into account: a film of one camera is located with all "
+    "rows of a frame at its instant; move slowly, or take two cameras"
 )
 _NUMBERS = re.compile(r"(\D*)(\d*)")
 
