@@ -11,7 +11,7 @@ from cuspid.model.camera import Camera
 from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
 from cuspid.simulation.appearance import APPEARANCES
-from cuspid.simulation.hits import Rays, ShadedMesh, first_hits, trace
+from cuspid.simulation.hits import Rays, ShadedMesh, first_hits, point_of, trace
 from cuspid.simulation.raycast import Scene, lamps, pixel_rays
 from cuspid.simulation.shadows import illuminate, segments
 
@@ -114,3 +114,11 @@ def test_what_is_narrower_than_a_pixel_is_the_only_thing_to_be_missed() -> None:
         found = first_hits(mesh, scene.surface, origin, rays, firsts, SAMPLES, camera.width)
         np.testing.assert_array_equal(found.faces >= 2, everything.faces >= 2)
         assert (found.faces >= 2).sum() >= 2 * 2 * camera.height
+
+
+def test_a_ray_hits_at_its_distance_from_its_own_origin() -> None:
+    towards = np.array([[0.0, 0, 2], [0, 1, 0]])
+    for origins in (np.array([[1.0, 2, 3], [10, 20, 30]]), np.array([[1.0, 2, 3]])):
+        rays = Rays(origins, towards, np.zeros(2, np.int64), np.array([5.0, 7.0]), np.zeros((2, 2)))
+        found = [point_of(rays, index) for index in range(2)]
+        np.testing.assert_allclose(found, origins + [[0, 0, 10], [0, 7, 0]])
