@@ -158,7 +158,7 @@ def landmarks(result: Result) -> str:
             f"Six real arches with landmarks that people set: {total['count']} are the same points as ours. Median "
             f"{mark(total['median_mm'], 0.35)} mm (bar 0.35), P90 {mark(total['p90_mm'], 1.0)} mm (bar 1.0), "
             f"{total['beyond_1_mm_pct']:.0f} % beyond 1 mm; error over stated uncertainty {total['over_stated']:.1f}. "
-            f"On the three that were looked at only at the end: {held['median_mm']:.2f} and {held['p90_mm']:.2f} mm, "
+            f"On those that were looked at only at the end: {held['median_mm']:.2f} and {held['p90_mm']:.2f} mm, "
             f"error over stated uncertainty {held['over_stated']:.1f}. Widths, median error in mm (bars 0.5, largest "
             f"1.2): {_widths(real['widths'])}. Not counted, as they do not lie on their tooth: "
             f"{', '.join(real['not_on_their_tooth']) or 'none'}.",

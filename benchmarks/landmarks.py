@@ -44,8 +44,9 @@ from cuspid.model.jaw import ARCHES, Arch, Landmark
 from cuspid.storage import write_json
 from cuspid.storage.jaws import read_labelled_mesh
 
-DEVELOPED_ON = ("AE_LOWER", "HC_UPPER", "KEC_LOWER")
-"""Arches that were looked at while the estimator was made; the others only at the end."""
+DEVELOPED_ON = ("AE_LOWER", "AE_UPPER", "HC_LOWER", "HC_UPPER")
+"""Arches that were looked at while the estimator was made; the others only at the end (KEC_LOWER also while an earlier
+version was)."""
 CODES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
     "incisor": {"incisal_edge": (6,)},
     "canine": {"cusp_tip": (6,)},

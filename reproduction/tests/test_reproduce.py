@@ -424,6 +424,7 @@ def test_what_cannot_be_stitched_is_a_result_and_the_next_method_is_tried(tmp_pa
     assert "quick" not in found["panorama/lower-14-0-thesis"]
 
 
+@pytest.mark.long
 def test_a_command_that_fails_is_told_with_its_last_words(tmp_path):
     with pytest.raises(CuspidError, match=r"evaluate failed with status 1: .*nowhere"):
         run_timed("evaluate", "nowhere.ply", "nowhere", "--out", str(tmp_path / "out"), log=tmp_path / "log")

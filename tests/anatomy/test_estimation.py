@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from cuspid.anatomy.landmarks.dimensions import arch_dimensions, needed_landmarks
 from cuspid.anatomy.landmarks.estimation import SIGMA_MM, estimate_landmarks, with_estimates
-from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, labels_of, missing, tip_direction
+from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, central_groove_u, labels_of, missing, tip_direction
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.geometry import Rigid3
-from cuspid.model.jaw import GUM, Jaw, Landmark
+from cuspid.model.jaw import ARCHES, GUM, Jaw, Landmark
 from cuspid.report.figures.landmark import save_landmark_picture, save_measure_picture
 from cuspid.runtime.errors import InputError
 
@@ -67,17 +67,23 @@ def test_the_uncertainties_cover_the_errors(phantom: Jaw):
 
 
 def test_tips_of_worn_cusps_are_their_outer_corners():
-    """On a molar in both directions, on the lingual side of a premolar across the arch; its buccal one is highest."""
+    """On a molar in both directions, on the lingual side of a premolar across the arch; in a lower jaw more so."""
     for name, signs in (("mesiobuccal_cusp", (-1, 1)), ("distobuccal_cusp", (1, 1)), ("mesiolingual_cusp", (-1, -1))):
-        assert tuple(np.sign(tip_direction("molar", name))) == (*signs, 1)
-    assert tuple(np.sign(tip_direction("premolar", "lingual_cusp"))) == (0, -1, 1)
-    assert tuple(tip_direction("premolar", "buccal_cusp")) == (0, 0, 1)
+        assert all(tuple(np.sign(tip_direction(arch, name))) == (*signs, 1) for arch in ARCHES)
+    for name in ("lingual_cusp", "mesiolingual_cusp"):
+        assert tip_direction("lower", name)[1] < tip_direction("upper", name)[1] < 0
+
+
+def test_the_central_groove_of_a_molar_lies_between_its_outline_and_its_cusps():
+    cusps = [np.array([u, v]) for u, v in ((-2.0, 3.0), (1.0, 3.0), (-1.0, -3.0), (4.0, -3.0))]
+    assert central_groove_u("molar", cusps) == pytest.approx(0.25)
+    assert central_groove_u("premolar", cusps) == 0.0
 
 
 def test_cusps_and_edges_lie_on_the_surface_and_few_are_far(phantom: Jaw):
     found = estimated(phantom)
     tips = np.array([point.position for label, point in found.items() if "cusp" in label or "edge" in label])
-    assert phantom.mesh.closest(tips)[0].max() < 0.15
+    assert phantom.mesh.closest(tips)[0].max() < 1e-6
     lengths = np.array([np.linalg.norm(error) for error in errors_mm(phantom, found).values()])
     assert 0.02 < np.median(lengths) < 0.25
     assert np.mean(lengths < 1.0) > 0.94

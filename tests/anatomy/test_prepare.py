@@ -19,7 +19,7 @@ from cuspid.anatomy.preparation.prepare import (
     prepare,
     preset,
 )
-from cuspid.anatomy.preparation.tooth_site import ToothSite, site_of
+from cuspid.anatomy.preparation.tooth_site import Border, ToothSite, site_of
 from cuspid.model.jaw import GUM, Jaw, Landmark
 from cuspid.model.mesh import Mesh
 from cuspid.runtime.errors import InputError
@@ -224,3 +224,11 @@ def test_options_are_checked_and_named() -> None:
     with pytest.raises(InputError, match="width-um"):
         CrackOptions(width_um=0.0)
     assert isinstance(preset("thesis-reference")[42], FullContourCrownOptions)
+
+
+def test_a_border_is_quadratic_in_its_reach_and_level_beyond() -> None:
+    centre, reach = np.array([1.0, -2.0]), np.array([3.0, 4.0])
+    border = Border(fdi=45, side=1.0, centre=centre, reach=reach, coefficients=np.array([1, 2, 3, 4, 5, 6.0]))
+    y, z = np.array([2.0, 1.0, 1.0, 90.0, -90.0]), np.array([1.0, 9.0, -9.0, -2.0, -2.0])
+    dy, dz = np.array([1.0, 0.0, 0.0, 3.0, -3.0]), np.array([3.0, 4.0, -4.0, 0.0, 0.0])
+    np.testing.assert_allclose(border.x(y, z), 1 + 2 * dy + 3 * dz + 4 * dy**2 + 5 * dy * dz + 6 * dz**2)

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boards import BOARD, moving, scene, views_of
-from cuspid.calibration.agreement import agreed_on, disagreement_between, started_later
+from cuspid.calibration.agreement import consensus_motion, disagreement_between, started_later
 from cuspid.calibration.bundle import BoardScene, Timing
 from cuspid.calibration.calibrate import _delays, _misnumbered
 from cuspid.calibration.corners import BoardView
-from cuspid.calibration.joining import joined_boards
+from cuspid.calibration.joining import join_boards
 from cuspid.calibration.start import join_cameras
 from cuspid.geometry import Rigid3
 from cuspid.model.board import BoardSet
@@ -68,7 +68,7 @@ def test_the_motion_of_most_instants_is_the_agreed_one(wrong: int, seed: int) ->
     true = random_poses(rng, 1)[0]
     near = [Rigid3.from_rotation_vector(v, rng.normal(0, 0.1, 3)) @ true for v in rng.normal(0, 0.005, (10, 3))]
     said = [[pose, *random_poses(rng, 1)] for pose in near] + [random_poses(rng, 2) for _ in range(wrong)]
-    best, agreeing, off_deg = agreed_on(said, AWAY_MM)
+    best, agreeing, off_deg = consensus_motion(said, AWAY_MM)
     assert 10 <= agreeing <= 10 + wrong
     assert (best @ true.inverse()).angle_deg < 3
     assert 0 < off_deg < 5
@@ -89,7 +89,7 @@ def test_cameras_before_several_boards_are_told_too() -> None:
     views = views_of(truth, BOARD, 0.1, np.random.default_rng(0))
     late = {(name, f"{int(at) - 3 * (name == 'cam1'):02d}"): view for (name, at), view in views.items()}
     with pytest.raises(ReconstructionError, match="13 of 13 do if cam1 began 3 instants later than cam0"):
-        joined_boards(late, boards, truth.cameras)
+        join_boards(late, boards, truth.cameras)
 
 
 @pytest.mark.parametrize(

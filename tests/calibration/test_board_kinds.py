@@ -158,6 +158,12 @@ def test_hidden_circles_are_left_out_and_part_of_a_grid_is_none(board: Board) ->
     assert find_corners(image, replace(board, rows=board.rows - 1)) is None
 
 
+def test_the_size_of_circles_is_measured_in_one_image() -> None:
+    image = photograph(CIRCLES, WIDE, pose_before(CIRCLES, 14.0, 20.0))
+    assert measure_circle_share(image, CIRCLES) == pytest.approx(CIRCLES.circle_share, rel=0.04)
+    assert measure_circle_share(np.full_like(image, 90), CIRCLES) is None
+
+
 # --- calibration -------------------------------------------------------------------------------------------------
 
 

@@ -600,6 +600,7 @@ def test_a_calibration_that_fails_leaves_the_one_before(tmp_path, capsys):
     assert {path.name: path.read_bytes() for path in (tmp_path / "rig").iterdir()} == before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["charuco", "chessboard"])
 def test_a_dark_board_of_16_bits_has_the_corners_of_a_bright_one(tmp_path, kind):
     """Of which 8 bits would leave 16 levels of grey."""

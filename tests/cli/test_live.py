@@ -71,6 +71,7 @@ def test_a_folder_is_followed_while_images_are_written(tmp_path: Path, capsys: p
     assert len(storage.read_mesh(tmp_path / "scan" / "mesh.ply").faces) > 1000
 
 
+@pytest.mark.long
 def test_without_frames_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "scan"
     assert "no such folder" in refused(capsys, "live", tmp_path / "none", "--watch", "--out", out)
@@ -101,6 +102,7 @@ def feed(*frames: Frame | None, error: InputError | None = None, capture: Captur
     return _Feed(handpiece=taken.handpiece, source=lambda: taken.source, frames=coming(), left_out=lambda: ())
 
 
+@pytest.mark.long
 def test_pauses_and_incomplete_frames_before_the_first_whole_one_do_no_harm(tmp_path: Path) -> None:
     torn, alone, whole = scan().frames[:3]
     alone = replace(alone, cameras=alone.cameras[:1])

@@ -146,7 +146,7 @@ def test_a_perfect_scan_has_no_error(coarse_arch: Jaw) -> None:
     assert all(each.outliers_pct == 0 and each.coverage_pct > 95 for each in report.spheres.values())
 
 
-@pytest.mark.parametrize("ppm", [-300.0, 100.0])
+@pytest.mark.parametrize("ppm", [-300.0, 100.0, 2000.0])
 def test_a_wrong_scale_is_found_in_proportion_to_distance(coarse_arch: Jaw, ppm: float) -> None:
     report = measured(coarse_arch, lambda vertices: vertices * (1 + 1e-6 * ppm))
     for each in report.spacings:

@@ -355,7 +355,7 @@ def test_what_the_automatic_chose_is_held():
 
 def test_a_camera_whose_automatic_does_not_tell_what_it_chose_is_found_out():
     (note,) = device(Uvc(tells=False)).prepare(ExposureOptions()).notes
-    assert "times as bright since the exposure is held" in note
+    assert "times as bright since the exposure was fixed" in note
     assert "--exposure-ms" in note
 
 
@@ -553,7 +553,7 @@ def test_what_cannot_be_recorded_is_refused(tmp_path, capsys):
         (("--cameras", film, f"left={film}", "--out", out), "two cameras are named left"),
         (("--cameras", film, f"right={film}", "--out", out), "is camera left already"),
         (("--cameras", f"../x={film}", "--out", out), "cannot be used as a name"),
-        (("--cameras", tmp_path / "text.txt", "--out", out), "no camera, video or folder"),
+        (("--cameras", tmp_path / "text.txt", "--out", out), "not a camera, video or folder"),
         (("--cameras", film, "--rehearse", film, "--out", out), "leave out --cameras"),
     ):
         assert message in refused(capsys, "record", *arguments)

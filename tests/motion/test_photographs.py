@@ -26,7 +26,7 @@ from cuspid.motion.monocular.scale import BoardSighting, PhotoScaleOptions, scal
 from cuspid.pipeline import photographs as photograph_pipeline
 from cuspid.runtime.errors import CuspidError, InputError, ReconstructionError
 from cuspid.storage.photographs import is_photographs, read_photographs
-from photo_scene import BOARD, BOARD_PLACE_MM, WIDE, scene
+from photo_scene import BOARD, BOARD_PLACE_MM, WIDE, relief, scene
 from synthetic_scene import speckle
 
 BOARD_OPTIONS = PhotoScaleOptions(columns=BOARD.columns, rows=BOARD.rows, square_mm=BOARD.square_mm)
@@ -45,6 +45,24 @@ def photographs(folder):
 @pytest.fixture(scope="module")
 def model(photographs):
     return locate_photographs(photographs)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """The model that would be found without any error, in units of half a millimetre."""
+    poses, grid = scene().poses, np.stack(np.meshgrid(*[np.linspace(-11, 11, 15)] * 2), axis=-1).reshape(-1, 2)
+    points = np.column_stack([grid, relief(*grid.T)])
+    frame, point = (each.ravel() for each in np.indices((len(poses), len(points))))
+    tracks = Tracks(
+        points=points,
+        colors=np.zeros((len(points), 3), np.uint8),
+        point_index=point,
+        frame_index=frame,
+        camera_index=np.zeros(len(point), int),
+        pixels=np.concatenate([WIDE.project(pose.apply(points)) for pose in poses.values()]),
+    )
+    cameras, camera_of = {"camera": WIDE}, dict.fromkeys(poses, "camera")
+    return PhotoModel(cameras=cameras, camera_of=camera_of, cam_from_world=poses, tracks=tracks).scaled(2.0)
 
 
 def centres(poses):
@@ -67,15 +85,14 @@ def test_poses_and_lens_are_those_of_the_camera(model):
     assert 0.05 < model.reprojection_rms_px < 0.6
 
 
-@pytest.mark.long
-def test_the_board_sets_the_scale(model, photographs):
-    scale = photograph_pipeline.find_scale(model, photographs, BOARD_OPTIONS)
+def test_the_board_sets_the_scale(exact, photographs):
+    scale = photograph_pipeline.find_scale(exact, photographs, BOARD_OPTIONS)
     true = scene().poses
-    expected, _, _ = best_similarity(centres(model.cam_from_world.values()), centres(true.values()))
+    expected, _, _ = best_similarity(centres(exact.cam_from_world.values()), centres(true.values()))
     assert 0 < abs(scale.mm_per_unit / expected - 1) < 0.001
     assert 0 < scale.sigma_share < 0.001
     assert not scale.notes
-    located = photograph_pipeline.to_capture(model, photographs, scale)
+    located = photograph_pipeline.to_capture(exact, photographs, scale)
     assert located.found.has_scale
     depth = np.concatenate([depth[np.isfinite(depth)] for depth in scene().depths.values()])
     near, far = located.capture.handpiece.depth_range_mm
@@ -84,12 +101,11 @@ def test_the_board_sets_the_scale(model, photographs):
     assert np.percentile(depth, 98) < far < 1.5 * depth.max()
 
 
-@pytest.mark.long
-def test_a_bent_board_is_told(model, photographs, monkeypatch):
+def test_a_bent_board_is_told(exact, photographs, monkeypatch):
     flat = type(BOARD).corners.fget
     bent = property(lambda board: flat(board) + [[0, 0, 1.0]] * np.square(flat(board)[:, :1] / 10 - 1))
     monkeypatch.setattr(type(BOARD), "corners", bent)
-    (note,) = photograph_pipeline.find_scale(model, photographs, BOARD_OPTIONS).notes
+    (note,) = photograph_pipeline.find_scale(exact, photographs, BOARD_OPTIONS).notes
     assert "bent" in note
 
 
@@ -138,8 +154,7 @@ def test_a_calibration_is_held(photographs):
     assert 0 < np.linalg.norm(off, axis=1).max() < 0.1
 
 
-@pytest.mark.long
-def test_a_measured_distance_sets_the_scale(model, photographs):
+def test_a_measured_distance_sets_the_scale(exact, photographs):
     true = scene().poses
     ends = np.array([[*BOARD_PLACE_MM, 0.0], [-4.0, 2.0, 0.0]])
     ends[1, 2] = 0.0
@@ -148,17 +163,16 @@ def test_a_measured_distance_sets_the_scale(model, photographs):
     given = (*places[0], *places[1], float(np.linalg.norm(ends[1] - ends[0])))
     between = (one, f"{other}.png")
     options = PhotoScaleOptions(between=between, distance=given)
-    scale = photograph_pipeline.find_scale(model, photographs, options)
-    expected, _, _ = best_similarity(centres(model.cam_from_world.values()), centres(true.values()))
-    assert 0 < abs(scale.mm_per_unit / expected - 1) < 0.01
+    scale = photograph_pipeline.find_scale(exact, photographs, options)
+    expected, _, _ = best_similarity(centres(exact.cam_from_world.values()), centres(true.values()))
+    assert scale.mm_per_unit == pytest.approx(expected, rel=1e-9)
     swapped = (*places[0], *places[1][2:], *places[1][:2], 7.0)
     with pytest.raises(InputError, match="not the same"):
-        photograph_pipeline.find_scale(model, photographs, replace(options, distance=swapped))
+        photograph_pipeline.find_scale(exact, photographs, replace(options, distance=swapped))
 
 
-@pytest.mark.long
-def test_without_a_scale_nothing_is_in_millimetres(model, photographs, tmp_path, monkeypatch):
-    monkeypatch.setattr(photograph_pipeline, "locate_photographs", lambda *_, **__: model)
+def test_without_a_scale_nothing_is_in_millimetres(exact, photographs, tmp_path, monkeypatch):
+    monkeypatch.setattr(photograph_pipeline, "locate_photographs", lambda *_, **__: exact)
     located = photograph_pipeline.locate(photographs, tmp_path)
     assert not located.found.has_scale
     assert located.scale is None
@@ -216,10 +230,9 @@ def test_given_poses_are_taken(model, photographs, tmp_path):
     assert 0.05 < posed.reprojection_rms_px < 1.0
 
 
-@pytest.mark.long
-def test_poses_of_other_photographs_are_refused(model, photographs, tmp_path):
-    located = photograph_pipeline.to_capture(model, photographs, None)
-    write_model(tmp_path, located.found, located.capture, {name: f"other-{name}.png" for name in model.frames})
+def test_poses_of_other_photographs_are_refused(exact, photographs, tmp_path):
+    located = photograph_pipeline.to_capture(exact, photographs, None)
+    write_model(tmp_path, located.found, located.capture, {name: f"other-{name}.png" for name in exact.frames})
     with pytest.raises(InputError, match=r"named like other-IMG_00\.png"):
         take_photograph_poses(photographs, tmp_path)
 
@@ -386,11 +399,10 @@ def test_masks_that_do_not_fit_are_refused(tmp_path, capsys, shape, value, said)
     assert "masks/1.png" in line
 
 
-@pytest.mark.long
-def test_a_board_that_no_photograph_shows_is_told(model, photographs):
+def test_a_board_that_no_photograph_shows_is_told(exact, photographs):
     absent = replace(BOARD_OPTIONS, dictionary="7X7_50")
     with pytest.raises(ReconstructionError, match="is seen in none of 8 photographs"):
-        photograph_pipeline.find_scale(model, photographs, absent)
+        photograph_pipeline.find_scale(exact, photographs, absent)
 
 
 def test_two_ways_to_the_scale_are_refused():

@@ -49,6 +49,7 @@ def errors_um(found: Reconstruction, way: Mapping[str, Rigid3]) -> np.ndarray:
     return 1000 * np.linalg.norm(off, axis=1)
 
 
+@pytest.mark.long
 def test_a_path_is_found_from_surfaces() -> None:
     found = tracked(depth_maps(OUT))
     assert found.frames == tuple(OUT)
@@ -83,6 +84,7 @@ def strip(frames: int, rng: np.random.Generator, error: Errors) -> tuple[list[Su
     return surfaces, way
 
 
+@pytest.mark.long
 def test_a_long_path_that_was_found_bent_is_straightened() -> None:
     rng = np.random.default_rng(0)
     surfaces, way = strip(50, rng, lambda x, y: rng.normal(0, 0.003, len(x)))

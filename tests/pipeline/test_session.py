@@ -123,6 +123,7 @@ def test_a_correction_puts_the_surface_where_it_belongs(monkeypatch: pytest.Monk
     assert np.linalg.norm((session.rig_from_world["00002"] @ WAY["00002"].inverse()).translation) < 0.01
 
 
+@pytest.mark.long
 def test_what_a_correction_cannot_place_is_taken_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     session = session_of(scan(), tmp_path)
     _, parts = followed(session, scan().frames)

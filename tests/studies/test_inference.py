@@ -15,6 +15,7 @@ from cuspid.studies.scanners.inference import (
     scans_for_precision,
     scans_needed,
 )
+from cuspid.studies.scanners.statistics import plan
 
 pytest.importorskip("statsmodels", reason="statsmodels is not installed: pip install 'cuspid[study]'")
 
@@ -122,3 +123,18 @@ def test_sample_sizes_are_those_of_tables():
     count = scans_for_precision(2.0)
     low, high = stats.chi2.ppf([0.025, 0.975], count - 1)
     assert np.sqrt(high / low) <= 2.0 < np.sqrt(stats.chi2.ppf(0.975, count - 2) / stats.chi2.ppf(0.025, count - 2))
+
+
+@pytest.mark.parametrize("sd_um", [0.0, 0.3, 3.0])
+def test_the_next_study_is_planned_from_the_scatter_of_repeats(sd_um):
+    """However far scanners and specimens lie apart; where repeats do not scatter, two of them do."""
+    rows = [
+        {"scanner": scanner, "specimen": specimen, "mean_abs_um": 10.0 * number + sign * sd_um / np.sqrt(2)}
+        for number, (scanner, specimen) in enumerate([("A", "m"), ("A", "n"), ("B", "m"), ("B", "n")])
+        for sign in (-1, 1)
+    ]
+    planned = plan(rows, (), 0.5)
+    assert planned["sd_um"] == pytest.approx(sd_um, abs=1e-9)
+    assert (planned["freedom"], planned["pairs"]) == (4, 1)
+    assert planned["scans"]["0.5"] == (scans_needed(sd_um, 0.5, 1) if sd_um else 2)
+    assert plan(rows[::2], (), 0.5) is None

@@ -26,7 +26,7 @@ from cuspid.runtime.errors import InputError
 from cuspid.studies.scanners.files import find_files, without_repeats
 from cuspid.studies.scanners.scan import StudyOptions
 from cuspid.studies.scanners.soundness import count_cuts, cut_notes, mend_faces
-from cuspid.studies.scanners.specimen import guess_unit, load_specimen
+from cuspid.studies.scanners.specimen import _segments, guess_unit, load_specimen
 from cuspid.studies.scanners.study import Intake, compare, measure_share, plan_comparison, prepare
 from cuspid.studies.scanners.summary import Group, difference_um, group_row, region_of
 from horseshoe import horseshoe, without_base
@@ -426,3 +426,9 @@ def test_a_region_that_is_not_there_is_refused(tmp_path, jaw, specimen):
         region_of(specimen, StudyOptions(region="area"))
     with pytest.raises(InputError, match="no tooth 46"):
         load_specimen("m", tmp_path / "m.ply", align_teeth=(46,))
+
+
+def test_a_segment_is_a_third_of_the_length_of_the_curve():
+    curve = np.array([[0.0, 0, 0], [10, 0, 0], [10, 20, 0]])
+    assert _segments(np.array([0.0, 9.9, 10.1, 19.9, 20.1, 30.0]), curve).tolist() == [0, 0, 1, 1, 2, 2]
+    assert _segments(np.array([np.nan]), np.empty((0, 3))).tolist() == [-1]

@@ -225,6 +225,7 @@ def test_a_value_is_one_line_with_its_counts_and_sizes(
     assert repr(cuspid.Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=int))) == "Mesh(0 vertices, 0 faces, 0 mm)"
 
 
+@pytest.mark.long
 def test_a_notebook_shows_a_picture(capture: cuspid.Capture, truth: GroundTruth, found: Trueness) -> None:
     for value in (truth.jaw, truth.handpiece, capture, panorama(), found):
         html = value._repr_html_()

@@ -52,6 +52,7 @@ def test_an_interrupt_that_is_passed_over_stays_so(tmp_path: Path) -> None:
     assert begun.wait(60) == 0
 
 
+@pytest.mark.long
 def test_whoever_reads_it_may_stop_reading():
     """As ``cuspid run --help | head -1`` does."""
     reader, writer = os.pipe()

@@ -19,12 +19,12 @@ _FEWEST, _OVERLAP = 5, 0.4
 """Instants that two cameras share if one began later: at least, and at least as a share of those of either."""
 
 Poses = Mapping[str, Sequence[Rigid3]]
-"""By instant, ``cam_from_board`` under each numbering of the corners."""
+"""``cam_from_board`` under each numbering of the corners, by instant."""
 
 
 def consensus_motion(candidates: Sequence[Sequence[Rigid3]], distance_mm: float) -> tuple[Rigid3, int, float]:
-    """Of the motions that each instant leaves open, the one that the most instants agree with, how many do, and by how
-    many degrees an instant is off in the median."""
+    """The motion that most instants support, out of the candidates of each instant, how many support it, and the median
+    deviation of the instants, degrees."""
     motions = [each for options in candidates for each in options]
     instant = np.repeat(np.arange(len(candidates)), [len(options) for options in candidates])
     turns, shifts = (

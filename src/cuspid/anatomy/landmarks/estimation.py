@@ -7,12 +7,13 @@ What is looked for, by the definitions of `cuspid.anatomy.landmarks.scheme`:
   60 degrees from up); the middle of the edge lies half-way between its angles, in the middle of what wear made flat;
 - cusps are summits, told apart by where the cusps of that tooth normally lie (`cuspid.anatomy.teeth.dentition`), after
   the shift that the row of summits shows; a cusp without a summit is a shoulder, the farthest point outwards and up;
-- the tip of a molar's cusp, and of a premolar's lingual one, is the point farthest in a direction that leans outwards a
-  little: of a top that is worn flat, the corner where its ridges met; that of a canine is the mean over such directions
-  all around;
+- the tip of a cusp is, of what is nearer to it than to others, the point farthest in a direction that leans outwards a
+  little (`tip_direction`): of a top that is worn flat, the corner where its ridges met; that of a canine is the mean
+  over such directions all around;
 - the buccal groove is where the rim is deepest below the line through the tips of the two buccal cusps; the rim bows
   out from that line a little (`RIM_BOW`);
-- the central groove is the deepest point below the plane of the cusps, half-way between mesial and distal;
+- the central groove is the deepest point below the plane of the cusps, between mesial and distal (`central_groove_u`)
+  and, of a floor that is worn flat, between the rows of cusps;
 - a cervix is the bottom of a parabola laid through the margin of the gum.
 
 The uncertainty of a point joins four parts: what phantoms with known landmarks show for that kind of point, a share of
@@ -35,6 +36,7 @@ from cuspid.anatomy.landmarks.scheme import (
     TOOTH_LANDMARKS,
     ToothKind,
     below_cusps,
+    central_groove_u,
     kind_of,
     labels_of,
     outwards,
@@ -59,7 +61,7 @@ _CUSP_SPREAD_MM = 1.5
 """How far a cusp usually lies from where it is expected."""
 _FARTHEST_CUSP_MM = 3.0
 """No cusp is this far from where it is expected."""
-_SHOULDER_DEG, _SHOULDER_MM = 45.0, 1.2
+_SHOULDER_DEG, _SHOULDER_MM = 40.0, 1.2
 """A cusp without a summit is the farthest point in this direction, from up to outwards, so near to where it is
 expected."""
 _TIP_REACH_MM = 1.6
@@ -69,6 +71,9 @@ _WORN_EDGE_DEG, _WORN_TIP_DEG = 25.0, 15.0
 _BUCCAL_CUSPS = ("buccal_cusp", "mesiobuccal_cusp", "distobuccal_cusp")
 _LINGUAL_CUSPS = ("lingual_cusp", "second_lingual_cusp", "mesiolingual_cusp", "distolingual_cusp")
 """Between these lies the central groove."""
+_PIT_PULL_PER_MM = 0.1
+"""A place counts as less deep by this times its squared distance from the middle between the rows of cusps: of a floor
+that is worn flat, its middle."""
 _PIT_SMOOTHING_MM = 0.4
 """Standard deviation of the smoothing before the search for a pit, where scans see least and faces are large."""
 RIM_BOW: Mapping[Arch, tuple[float, float]] = MappingProxyType({"lower": (0.094, 0.110), "upper": (0.063, 0.072)})
@@ -86,37 +91,37 @@ _PAPILLA_BELOW_MM = 1.0
 
 SIGMA_MM: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
-        "canine.cusp_tip": (0.08, 0.07),
-        "canine.distal_angle": (0.31, 0.68),
+        "canine.cusp_tip": (0.09, 0.06),
+        "canine.distal_angle": (0.30, 0.68),
         "canine.labial_cervix": (0.12, 0.06),
         "canine.lingual_cervix": (0.13, 0.00),
-        "canine.mesial_angle": (0.21, 0.37),
+        "canine.mesial_angle": (0.20, 0.38),
         "incisor.distal_angle": (0.22, 0.26),
-        "incisor.incisal_edge": (0.08, 0.16),
+        "incisor.incisal_edge": (0.08, 0.15),
         "incisor.labial_cervix": (0.10, 0.08),
         "incisor.lingual_cervix": (0.11, 0.06),
         "incisor.mesial_angle": (0.13, 0.21),
-        "midline": (0.00, 0.23),
-        "molar.buccal_groove": (0.04, 0.07),
-        "molar.central_groove": (0.16, 0.07),
-        "molar.distobuccal_cusp": (0.16, 0.03),
-        "molar.mesiobuccal_cusp": (0.14, 0.05),
-        "molar.mesiolingual_cusp": (0.13, 0.05),
+        "midline": (0.00, 0.22),
+        "molar.buccal_groove": (0.04, 0.06),
+        "molar.central_groove": (0.15, 0.02),
+        "molar.distobuccal_cusp": (0.16, 0.00),
+        "molar.mesiobuccal_cusp": (0.14, 0.02),
+        "molar.mesiolingual_cusp": (0.14, 0.00),
         "papilla": (0.00, 0.24),
         "premolar.buccal_cervix": (0.08, 0.06),
-        "premolar.buccal_cusp": (0.03, 0.04),
-        "premolar.central_groove": (0.14, 0.07),
+        "premolar.buccal_cusp": (0.06, 0.04),
+        "premolar.central_groove": (0.19, 0.00),
         "premolar.lingual_cervix": (0.10, 0.06),
-        "premolar.lingual_cusp": (0.18, 0.00),
+        "premolar.lingual_cusp": (0.04, 0.08),
     }
 )
 """Standard uncertainty (one axis) of each kind of point: a constant in mm, and a share of the edge length of the mesh.
 
 From the errors on phantoms of seeds 100 to 113, both arches, with edges of 0.5 and 0.9 mm: what the spread under tilts
 and smoothing does not explain (`python benchmarks/landmarks.py --calibrate`)."""
-REAL_TEETH_MM = 0.26
+REAL_TEETH_MM = 0.28
 """Standard uncertainty (one axis) that real teeth, of other forms than the phantom's, worn and restored, and people's
-judgement of where a point is add to those: from 101 points that people set on three arches
+judgement of where a point is add to those: from 133 points that people set on four arches
 (``benchmarks/landmarks.py``, `DEVELOPED_ON`)."""
 
 
@@ -179,14 +184,14 @@ def _all_points(
     """Every landmark that can be found, by label, in the jaw."""
     points: dict[str, Point] = {}
     for fdi, view in views.items():
-        found = _tooth_points(view, arch) | _cervices(view, margins.get(fdi, _NO_POINTS))
+        found = _tooth_points(jaw.mesh, view, arch) | _cervices(view, margins.get(fdi, _NO_POINTS))
         points |= {f"{fdi}.{name}": found[name] for name in TOOTH_LANDMARKS[kind_of(fdi)] if name in found}
     points |= _midline_points(jaw, arch, views, margins, points)
     return {label: points[label] for label in labels_of(views) if label in points}
 
 
-def _tooth_points(view: ToothView, arch: Arch) -> dict[str, Point]:
-    """The landmarks on a crown, in the jaw."""
+def _tooth_points(mesh: Mesh, view: ToothView, arch: Arch) -> dict[str, Point]:
+    """The landmarks on a crown, in the jaw; on its mesh, which the height field leaves a little."""
     kind = kind_of(view.fdi)
     if kind in ("incisor", "canine"):
         places = _edge_places(view, kind)
@@ -195,7 +200,8 @@ def _tooth_points(view: ToothView, arch: Arch) -> dict[str, Point]:
         places["central_groove"] = _central_groove(view, places)
         if kind == "molar":
             places["buccal_groove"] = _buccal_groove(view, RIM_BOW[arch][view.fdi % 10 > 6], places)
-    return {name: view.lift(place) for name, place in places.items()}
+    _, _, points = mesh.closest(np.array([view.lift(place) for place in places.values()]))
+    return dict(zip(places, points, strict=True))
 
 
 # Edges
@@ -237,8 +243,7 @@ def _cusp_places(view: ToothView, arch: Arch) -> dict[str, Place]:
     """The tips at the summits that suit the cusps of the tooth best; where none does, a shoulder near the expected
     place."""
     expected = _expected_cusps(view.fdi, arch)
-    kind = kind_of(view.fdi)
-    named = np.isin(list(expected), TOOTH_LANDMARKS[kind])
+    named = np.isin(list(expected), TOOTH_LANDMARKS[kind_of(view.fdi)])
     places = np.array(list(expected.values())) * [view.half_width_mm, view.half_depth_mm]
     summits = view.summits(_CUSPS_APART_MM)
     shift = np.zeros(2)
@@ -247,14 +252,15 @@ def _cusp_places(view: ToothView, arch: Arch) -> dict[str, Place]:
         known = named & (chosen < len(summits))
         if known.any():
             shift = (summits[chosen[known]] - places[known]).mean(axis=0)
+    has_summit = chosen < len(summits)
+    centres = places + shift
+    centres[has_summit] = summits[chosen[has_summit]]
+    nearest = np.linalg.norm(view.places[..., None, :] - centres, axis=-1).argmin(axis=-1)
     found = {}
-    for name, place, summit in zip(expected, places + shift, chosen, strict=True):
-        if summit < len(summits):
-            near = view.within(summits[summit] - _TIP_REACH_MM, summits[summit] + _TIP_REACH_MM)
-            found[name] = view.farthest(tip_direction(kind, name), near)
-        else:
-            near = view.within(place - _SHOULDER_MM, place + _SHOULDER_MM)
-            found[name] = view.farthest(_leaning(_SHOULDER_DEG, outwards(name)), near)
+    for k, (name, centre) in enumerate(zip(expected, centres, strict=True)):
+        reach = _TIP_REACH_MM if has_summit[k] else _SHOULDER_MM
+        towards = tip_direction(arch, name) if has_summit[k] else _leaning(_SHOULDER_DEG, outwards(name))
+        found[name] = view.farthest(towards, view.within(centre - reach, centre + reach) & (nearest == k))
     return found
 
 
@@ -284,14 +290,16 @@ def _buccal_groove(view: ToothView, bow: float, cusps: Mapping[str, Place]) -> P
 
 
 def _central_groove(view: ToothView, cusps: Mapping[str, Place]) -> Place:
-    """The deepest place below the plane of the cusps, half-way between mesial and distal."""
+    """The deepest place below the plane of the cusps, between mesial and distal."""
     rows = [[place for name, place in cusps.items() if name in row] for row in (_BUCCAL_CUSPS, _LINGUAL_CUSPS)]
     buccal, lingual = (np.column_stack([row, view.surface(np.array(row))]) for row in rows)
     down = below_cusps(buccal, lingual)
     sides = buccal[:, 1].mean(), lingual[:, 1].mean()
-    middle, half = np.mean(sides), 0.3 * abs(sides[0] - sides[1])
-    among = view.within(np.array([-0.6 * view.grid_mm, middle - half]), np.array([0.6 * view.grid_mm, middle + half]))
-    return view.smoothed(_PIT_SMOOTHING_MM).farthest(down, among)
+    middle = np.array([central_groove_u(kind_of(view.fdi), list(cusps.values())), np.mean(sides)])
+    reach = np.array([0.6 * view.grid_mm, 0.3 * abs(sides[0] - sides[1])])
+    depths = view.smoothed(_PIT_SMOOTHING_MM).reach(down)
+    depths = depths - _PIT_PULL_PER_MM * (view.places[..., 1] - middle[1]) ** 2
+    return view.top(depths, view.within(middle - reach, middle + reach))
 
 
 # The gum

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cuspid.geometry import Rigid3
-from cuspid.model.jaw import UNIVERSAL_FROM_FDI, Landmark
+from cuspid.model.jaw import UNIVERSAL_FROM_FDI, Arch, Landmark
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.values import quote
 
@@ -40,14 +40,39 @@ TOOTH_LANDMARKS: Mapping[ToothKind, tuple[str, ...]] = MappingProxyType(
 ``*_angle``: corner of the incisal edge; on a canine, the shoulder where the edge meets the proximal side.
 ``incisal_edge``: its middle. ``*_cusp``, ``cusp_tip``: the point of the cusp that is farthest in its `tip_direction`;
 of several lingual cusps of a premolar, the mesial one. ``central_groove``: deepest point of the central groove or fossa
-below the plane of the cusps, half-way between mesial and distal. ``buccal_groove``: where the (mesio)buccal groove
-crosses the occlusal rim. ``*_cervix``: lowest (most apical) point of the gum's margin on that side.
+below the plane of the cusps, at `central_groove_u` between mesial and distal. ``buccal_groove``: where the
+(mesio)buccal groove crosses the occlusal rim. ``*_cervix``: lowest (most apical) point of the gum's margin on that
+side.
 """
 ANGLE_DEG: Mapping[ToothKind, float] = MappingProxyType({"incisor": 45.0, "canine": 60.0})
 """Direction in which the angle of an edge is the farthest point, from up to sideways; the edge of a canine slopes."""
-_MOLAR_LEAN_DEG, _LINGUAL_LEAN_DEG = 10.0, 20.0
-"""Lean outwards of the direction in which the tip of a molar's cusp, or of a premolar's lingual one, is the farthest
-point: of a top that is worn flat, the corner where its ridges met."""
+_TIP_LEANS_DEG: Mapping[Arch, Mapping[str, tuple[float, float]]] = MappingProxyType(
+    {
+        "upper": {
+            "buccal_cusp": (-5.0, 10.0),
+            "lingual_cusp": (0.0, 20.0),
+            "mesiobuccal_cusp": (-10.0, 10.0),
+            "distobuccal_cusp": (10.0, 10.0),
+            "mesiolingual_cusp": (-10.0, 10.0),
+            "distolingual_cusp": (10.0, 10.0),
+        },
+        "lower": {
+            "buccal_cusp": (-5.0, 0.0),
+            "lingual_cusp": (-5.0, 30.0),
+            "second_lingual_cusp": (5.0, 30.0),
+            "mesiobuccal_cusp": (-10.0, 10.0),
+            "distobuccal_cusp": (10.0, 10.0),
+            "distal_buccal_cusp": (10.0, 10.0),
+            "mesiolingual_cusp": (-20.0, 30.0),
+            "distolingual_cusp": (20.0, 30.0),
+        },
+    }
+)
+"""Lean in degrees, distal and outwards (buccal or lingual), of the direction in which the tip of a cusp is the farthest
+point: of a top that is worn flat, the corner where its ridges met.
+
+Lingual cusps of lower teeth meet others on their inner side alone, and are worn there. From points that people set on
+four arches (``benchmarks/landmarks.py``)."""
 
 MIDLINE_LANDMARKS = ("papilla", "midline")
 """``papilla``: centre of the incisive papilla (upper), tip of the lingual papilla between the central incisors (lower).
@@ -65,11 +90,11 @@ def outwards(name: str) -> Float[np.ndarray, "2"]:
     return np.array([along, 1.0 if "buccal" in name else -1.0])
 
 
-def tip_direction(kind: ToothKind, name: str) -> Float[np.ndarray, "3"]:
-    """Direction (u, v, z), not of length one, in which the tip of a cusp of a premolar or molar is the farthest point:
-    up along the tooth, for most of them a little outwards; see :func:`outwards`."""
-    lean = _MOLAR_LEAN_DEG if kind == "molar" else _LINGUAL_LEAN_DEG if "lingual" in name else 0.0
-    return np.array([*np.tan(np.radians(lean)) * outwards(name), 1.0])
+def tip_direction(arch: Arch, name: str) -> Float[np.ndarray, "3"]:
+    """Direction (u distal, v buccal, z), not of length one, in which the tip of a cusp of a premolar or molar is the
+    farthest point: up along the tooth, for most of them a little outwards."""
+    distal, out = np.tan(np.radians(_TIP_LEANS_DEG[arch][name]))
+    return np.array([distal, out * outwards(name)[1], 1.0])
 
 
 def labels_of(teeth: Iterable[int]) -> tuple[str, ...]:
@@ -87,6 +112,12 @@ def below_cusps(buccal: Float[np.ndarray, "b 3"], lingual: Float[np.ndarray, "l 
         return np.array([0.0, across[2] / across[1], -1.0])
     centred = tips - tips.mean(axis=0)
     return np.array([*np.linalg.lstsq(centred[:, :2], centred[:, 2], rcond=None)[0], -1.0])
+
+
+def central_groove_u(kind: ToothKind, cusps: Collection[Float[np.ndarray, "_"]]) -> float:
+    """Where the central groove is looked for, mm distal of the middle of the outline of a tooth, by its cusps (u, v)
+    or (u, v, z): on a molar half-way from there to the mean of its cusps."""
+    return float(np.mean([cusp[0] for cusp in cusps]) / 2) if kind == "molar" else 0.0
 
 
 def teeth_named(labels: Iterable[str]) -> tuple[int, ...]:

@@ -79,6 +79,11 @@ class PlacedTooth:
         """Place in the quadrant, 1 (central incisor) to 7 (second molar)."""
         return self.fdi % 10
 
+    @property
+    def arch(self) -> Arch:
+        """The arch that it stands in."""
+        return "lower" if self.fdi > 30 else "upper"
+
     def to_tooth(self, points: Points) -> Points:
         """Points (n, 3) of the jaw in the frame of the tooth."""
         return np.einsum("ni,ij->nj", points - self.origin, self.axes)
@@ -219,7 +224,7 @@ def _chains(rows: Rows, closing: dict[int, Float[np.ndarray, "_"]], arch: Arch) 
             natural=_natural_headings(positions, arch),
             widths=np.array([tooth.crown.width_mm for _, tooth in rows[side]]),
             closing=closing[side],
-            points=np.array([_landmark_from_contacts(position, tooth) for position, tooth in rows[side]]),
+            points=np.array([_landmark_from_contacts(position, tooth, arch) for position, tooth in rows[side]]),
         )
 
     return chain(-1), chain(1)
@@ -233,11 +238,11 @@ def _natural_headings(positions: tuple[int, ...], arch: Arch) -> Float[np.ndarra
     return np.interp(np.cumsum(kept) - kept / 2, along, natural)
 
 
-def _landmark_from_contacts(position: int, tooth: Tooth) -> Point:
+def _landmark_from_contacts(position: int, tooth: Tooth, arch: Arch) -> Point:
     """The landmark that the arch is measured at, or else the middle of the tooth, from the line of contacts."""
     if position not in DIMENSION_POINTS:
         return np.array([0.0, tooth.offset_mm, 0.0])
-    point = crown_point(tooth.crown, kind_of(position), DIMENSION_POINTS[position])
+    point = crown_point(tooth.crown, arch, kind_of(position), DIMENSION_POINTS[position])
     return _stand(tooth) @ (point - _contact_centre(tooth.crown)) + [0.0, tooth.offset_mm, 0.0]
 
 
@@ -276,7 +281,7 @@ def _measure_landmarks(teeth: tuple[PlacedTooth, ...], aim: Aim, papilla_of: Pap
 def dimension_point(placed: PlacedTooth) -> Point:
     """The landmark of a canine or molar that the arch is measured at, in the jaw."""
     name = DIMENSION_POINTS[placed.position]
-    return placed.to_jaw(crown_point(placed.tooth.crown, kind_of(placed.fdi), name))
+    return placed.to_jaw(crown_point(placed.tooth.crown, placed.arch, kind_of(placed.fdi), name))
 
 
 def arch_dimensions(teeth: tuple[PlacedTooth, ...], aim: Aim, papilla_of: PapillaOf) -> Float[np.ndarray, "d"]:

@@ -4,7 +4,7 @@ A cusp tip is the point farthest along the long axis, or in a direction that lea
 incisal edge, the point farthest in a direction half-way between edge and side. The rim of a molar is taken at
 `RIM`, where its profile turns from the occlusal surface to the side; the buccal groove crosses it at the lowest point
 between the two mesial buccal cusps. The central groove is taken where it is deepest below the plane of the cusps,
-half-way between mesial and distal.
+between mesial and distal.
 """
 
 from dataclasses import dataclass
@@ -13,8 +13,16 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from cuspid.anatomy.landmarks.scheme import ANGLE_DEG, TOOTH_LANDMARKS, ToothKind, below_cusps, tip_direction
+from cuspid.anatomy.landmarks.scheme import (
+    ANGLE_DEG,
+    TOOTH_LANDMARKS,
+    ToothKind,
+    below_cusps,
+    central_groove_u,
+    tip_direction,
+)
 from cuspid.anatomy.teeth.crowns import Crown, Lobe, Values, crown_distance
+from cuspid.model.jaw import Arch
 
 Point = Float[np.ndarray, "3"]
 
@@ -40,25 +48,25 @@ class _Goal:
     """The direction."""
 
 
-def crown_points(crown: Crown, kind: ToothKind) -> dict[str, Point]:
+def crown_points(crown: Crown, arch: Arch, kind: ToothKind) -> dict[str, Point]:
     """The landmarks on the crown by name, mm: those of `TOOTH_LANDMARKS` but for the cervices."""
     names = [name for name in TOOTH_LANDMARKS[kind] if not name.endswith("_cervix")]
-    return dict(zip(names, _farthest(crown, [_goal(crown, kind, name) for name in names]), strict=True))
+    return dict(zip(names, _farthest(crown, [_goal(crown, arch, kind, name) for name in names]), strict=True))
 
 
 @lru_cache(maxsize=4096)
-def crown_point(crown: Crown, kind: ToothKind, name: str) -> Point:
+def crown_point(crown: Crown, arch: Arch, kind: ToothKind, name: str) -> Point:
     """One landmark on the crown, mm."""
-    return _farthest(crown, [_goal(crown, kind, name)])[0]
+    return _farthest(crown, [_goal(crown, arch, kind, name)])[0]
 
 
-def _goal(crown: Crown, kind: ToothKind, name: str) -> _Goal:
+def _goal(crown: Crown, arch: Arch, kind: ToothKind, name: str) -> _Goal:
     """What a landmark is."""
     if name == "central_groove":
-        return _deepest(crown)
+        return _deepest(crown, kind)
     if name == "buccal_groove":
         return _crossing(crown)
-    return _edge_point(crown, kind, name) if crown.edge else _tip(crown, kind, name)
+    return _edge_point(crown, kind, name) if crown.edge else _tip(crown, arch, name)
 
 
 def _edge_point(crown: Crown, kind: ToothKind, name: str) -> _Goal:
@@ -72,10 +80,10 @@ def _edge_point(crown: Crown, kind: ToothKind, name: str) -> _Goal:
     return _Goal(start=np.array([0.8 * side * crown.half_width_mm, y]), reach=np.ones(2), towards=towards)
 
 
-def _tip(crown: Crown, kind: ToothKind, name: str) -> _Goal:
+def _tip(crown: Crown, arch: Arch, name: str) -> _Goal:
     """The tip of a cusp by its name: the mesial or distal one of its side."""
     cusp = _row(crown, 1 if "buccal" in name else -1)[1 if name.startswith("disto") else 0]
-    return _Goal(start=_foot(crown, cusp), reach=np.full(2, 0.6), towards=tip_direction(kind, name))
+    return _Goal(start=_foot(crown, cusp), reach=np.full(2, 0.6), towards=tip_direction(arch, name))
 
 
 def _foot(crown: Crown, cusp: Lobe) -> Float[np.ndarray, "2"]:
@@ -95,13 +103,14 @@ def _crossing(crown: Crown) -> _Goal:
     return _Goal(start=start, reach=np.array([0.3 * (distal - mesial), 0.0]), towards=-UP)
 
 
-def _deepest(crown: Crown) -> _Goal:
-    """The deepest point between buccal and lingual cusps, half-way between mesial and distal."""
+def _deepest(crown: Crown, kind: ToothKind) -> _Goal:
+    """The deepest point between buccal and lingual cusps, between mesial and distal."""
     rows = [np.array([_foot(crown, cusp) for cusp in cusps]) for cusps in (_row(crown, 1)[:2], _row(crown, -1))]
     buccal, lingual = (np.column_stack([row, heights(crown, row)]) for row in rows)
     low, high = lingual[:, 1].max(), buccal[:, 1].min()
     reach = np.array([0.0, 0.4 * (high - low)])
-    return _Goal(start=np.array([0.0, (low + high) / 2]), reach=reach, towards=below_cusps(buccal, lingual))
+    start = np.array([central_groove_u(kind, [_foot(crown, cusp) for cusp in crown.cusps]), (low + high) / 2])
+    return _Goal(start=start, reach=reach, towards=below_cusps(buccal, lingual))
 
 
 def _farthest(crown: Crown, goals: list[_Goal]) -> Float[np.ndarray, "g 3"]:

@@ -42,7 +42,7 @@ def landmarks_of(solid: Solid, arch: Arch) -> dict[str, Landmark]:
 
 def _crown_points(placed: PlacedTooth) -> dict[str, Point]:
     """The landmarks on a crown, in the jaw."""
-    points = crown_points(placed.tooth.crown, kind_of(placed.fdi))
+    points = crown_points(placed.tooth.crown, placed.arch, kind_of(placed.fdi))
     return {name: placed.to_jaw(point) for name, point in points.items()}
 
 

@@ -154,7 +154,7 @@ def guess_unit(path: Path, mesh: Mesh, like_mm: float | None = None) -> tuple[Un
     width_mm = file.width_in(nearest)
     if not low <= width_mm <= high:
         raise InputError(
-            f"{path}: {file.width_mm:.4g} wide, which is no size of teeth or jaws in any unit"
+            f"{path}: {file.width_mm:.4g} wide, which is not the size of teeth or jaws in any unit"
             + ("" if like_mm is None else f", as its reference is {like_mm:.3g} mm wide")
             + f"; divided by 25.4 it would be {file.width_mm / 25.4:.3g}; scale it to millimetres"
         )
