@@ -113,7 +113,7 @@ def test_a_map_says_what_labels_are(tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text(json.dumps({str(n): fdi for fdi, n in table.items()}))
     jaw, _ = load_jaw(tmp_path / "jaw.ply", labelling=Labelling(label_map=tmp_path / "map.json"))
     assert sorted(jaw.teeth) == sorted(ROW)
-    for text, said in (("{}", "must hold"), ('{"x": 31}', "whole"), ('{"1": 50}', "between"), ('{"1": 20}', "no FDI")):
+    for text, said in (("{}", "must hold"), ('{"x": 31}', "whole"), ('{"1": 50}', "between"), ('{"1": 20}', "not an")):
         (tmp_path / "map.json").write_text(text)
         with pytest.raises(InputError, match=f"map.json.*{said}"):
             load_jaw(tmp_path / "jaw.ply", labelling=Labelling(label_map=tmp_path / "map.json"))

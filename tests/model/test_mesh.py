@@ -1,5 +1,6 @@
 import os
 import resource
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -195,6 +196,10 @@ def test_rays_without_memory_are_an_error_and_not_the_end_of_the_process() -> No
     if child == 0:
         held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (held + (4 << 20), resource.RLIM_INFINITY))
+        filled: list[bytearray] = []
+        with suppress(MemoryError):  # what was freed before is there to be had
+            while True:
+                filled.append(bytearray(1 << 18))
         try:
             mesh.cast(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
         except MemoryError:

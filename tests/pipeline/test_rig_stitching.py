@@ -105,8 +105,9 @@ def test_laid_over_the_surface_points_hold_the_path_nearer_to_the_truth(
     from_rig = film[1].handpiece.rig["left"].cam_from_rig
     true = np.array([(from_rig @ pose).inverse().translation for pose in film[1].rig_from_world.values()])
 
-    def median(poses: Iterable[Rigid3]) -> float:
-        return float(np.median(left_over(np.array([pose.inverse().translation for pose in poses]), true)))
+    def rms_mm(poses: Iterable[Rigid3]) -> float:
+        off = left_over(np.array([pose.inverse().translation for pose in poses]), true)
+        return float(np.sqrt(np.mean(off**2)))
 
     options = StitchOptions()
     never = replace(options.rig_patches, min_views=1000)
@@ -114,9 +115,9 @@ def test_laid_over_the_surface_points_hold_the_path_nearer_to_the_truth(
     assert before.motion is not None
     assert any("on the surface" in note for note in before.panorama.notes)
     assert not any("on the surface" in note for note in storage.read_panorama(pano).notes)
-    # 0.014 mm instead of 0.016.
+    # 0.017 mm instead of 0.025; over three other paths 11 to 41 % less.
     refined = storage.read_poses(pano / "poses.json").values()
-    assert 0.002 < median(refined) < 0.95 * median(before.motion.cam_from_world.values())
+    assert 0.002 < rms_mm(refined) < 0.85 * rms_mm(before.motion.cam_from_world.values())
 
 
 @pytest.mark.long

@@ -143,7 +143,7 @@ def test_how_a_jaw_lies_in_its_file_makes_no_difference(coarse_phantom: Jaw) -> 
         view_mesh(mesh, options) for mesh in (coarse_phantom.mesh, coarse_phantom.mesh.transformed(moved))
     )
     between = found @ moved @ upright.inverse()
-    assert between.angle_deg < 1.5
+    assert between.angle_deg < 2.5
     assert np.abs(between.translation).max() < 0.25  # half the spacing of the grid on which the crowns are found
     assert list(turned.strips) == list(plain.strips) == ["occlusal", "buccal", "lingual"]
     for name, strip in plain.strips.items():

@@ -125,7 +125,7 @@ def test_what_could_be_seen_follows_from_the_truth(found: Trueness, scan: cuspid
     assert found.accuracy.signed_mean_um == pytest.approx(10, abs=1)
     alone = cuspid.evaluate(scan, jaw, QUICK)
     assert alone.completeness_pct["50"] == pytest.approx(share, abs=1)
-    assert alone.scannable_pct == 100
+    assert alone.scannable_pct == pytest.approx(100)
 
 
 @pytest.mark.long
