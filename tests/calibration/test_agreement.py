@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from boards import BOARD, moving, scene, views_of
 from cuspid.calibration.agreement import consensus_motion, disagreement_between, started_later
 from cuspid.calibration.bundle import BoardScene, Timing
-from cuspid.calibration.calibrate import _delays, _misnumbered
+from cuspid.calibration.calibrate import _delays, _numbering_notes
 from cuspid.calibration.corners import BoardView
 from cuspid.calibration.joining import join_boards
 from cuspid.calibration.start import join_cameras
@@ -101,7 +101,7 @@ def test_cameras_before_several_boards_are_told_too() -> None:
     ],
 )
 def test_delays_of_whole_frames_are_wrong_numbers(delays: dict[str, float], told: list[str]) -> None:
-    assert list(_misnumbered(delays)) == told
+    assert list(_numbering_notes(delays)) == told
 
 
 def test_delays_do_not_depend_on_which_cameras_missed_the_board() -> None:

@@ -675,7 +675,7 @@ def _timing_notes(checks: Mapping[str, CameraCheck], frames_per_s: float | None)
             "the cameras did not expose together; by the motion of the board, in frames from their mean: "
             f"{', '.join(delays)}; this is taken into account, but a board at rest gives more accurate results"
         )
-        yield from _misnumbered({name: each.delay_frames or 0.0 for name, each in checks.items()})
+        yield from _numbering_notes({name: each.delay_frames or 0.0 for name, each in checks.items()})
     readouts = [
         describe(name, check.readout, check.readout_sigma, 3)
         for name, check in checks.items()
@@ -688,7 +688,7 @@ def _timing_notes(checks: Mapping[str, CameraCheck], frames_per_s: float | None)
         )
 
 
-def _misnumbered(delays_frames: Mapping[str, float]) -> Iterator[str]:
+def _numbering_notes(delays_frames: Mapping[str, float]) -> Iterator[str]:
     """Which cameras began whole frames later, or earlier, than most."""
     usual = median_low(delays_frames.values())
     for name, delay in delays_frames.items():

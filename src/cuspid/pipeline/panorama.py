@@ -123,7 +123,7 @@ def stitch(
         panoramas = method(frames, examination=options.examination, progress=progress)
         return require_content(Stitched(panorama=panorama, motion=None, strip=None) for panorama in panoramas)
     motion = locate_single(frames, options.motion, progress=progress)
-    brighter = common_brightening(map(frames.fine_image, range(len(frames))[_metered(len(frames))]))
+    brighter = common_brightening(map(frames.fine_image, range(len(frames))[_metering_slice(len(frames))]))
     notes = (*frames.notes, *motion.notes, *_brightness_notes(brighter))
     stitched = [_stitch_part(frames, motion, k, brighter, options, progress) for k in range(len(motion.parts))]
     return require_content(
@@ -156,7 +156,7 @@ def _median_shared_points(motion: SparseModel) -> float:
     return float(np.median([len(before & after) for before, after in pairwise(seen)] or [0]))
 
 
-def _metered(images: int) -> slice:
+def _metering_slice(images: int) -> slice:
     """Those of a film whose brightness is looked at."""
     return slice(None, None, max(1, images // _METERED))
 
@@ -247,7 +247,7 @@ class _RigScene:
     def brighter(self) -> float:
         """How many times brighter the images are shown and compared."""
         taken = [(frame.name, camera) for frame in self.capture.frames for camera in frame.cameras]
-        return common_brightening(self.capture.source.read(*image) for image in taken[_metered(len(taken))])
+        return common_brightening(self.capture.source.read(*image) for image in taken[_metering_slice(len(taken))])
 
     def read(self, name: str) -> UInt8[np.ndarray, "h w 3"]:
         """The image ``camera/frame``, or that of a frame and the camera whose picture it is."""
