@@ -3,9 +3,11 @@ inverse."""
 
 from cuspid.geometry.cameras.models import GRID, LENSES, MODELS, LensModel, fold_radius
 from cuspid.geometry.cameras.projection import (
-    camera_jacobian,
     directions_through,
     distort,
+    parameter_jacobian,
+    point_jacobian,
+    project,
     project_points,
     projection_derivatives,
 )
@@ -15,10 +17,12 @@ __all__ = [
     "LENSES",
     "MODELS",
     "LensModel",
-    "camera_jacobian",
     "directions_through",
     "distort",
     "fold_radius",
+    "parameter_jacobian",
+    "point_jacobian",
+    "project",
     "project_points",
     "projection_derivatives",
 ]

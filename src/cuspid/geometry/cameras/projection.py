@@ -152,11 +152,11 @@ def _ideal_derivatives(model, k, u, v):
 
 @kernel
 @no_type_check
-def _control_derivatives(k, u, v, by_parameters):
+def _control_derivatives(k, u, v, by_parameters, at):
     """Derivatives by the reach and the control points of a splined lens."""
     _, _, xu, xv, yu, yv = _shift(k, u, v)
-    by_parameters[0, _REACH] = -k[0] * (xu * u + xv * v) / k[_REACH]
-    by_parameters[1, _REACH] = -k[1] * (yu * u + yv * v) / k[_REACH]
+    by_parameters[0, at + _REACH] = -k[0] * (xu * u + xv * v) / k[_REACH]
+    by_parameters[1, at + _REACH] = -k[1] * (yu * u + yv * v) / k[_REACH]
     if not abs(u) < 4 * k[_REACH] or not abs(v) < 4 * k[_REACH]:
         return
     column, s = _cell(u, k[_REACH])
@@ -165,22 +165,30 @@ def _control_derivatives(k, u, v, by_parameters):
         for a in range(4):
             if 0 <= row + b < GRID and 0 <= column + a < GRID:
                 weight = _weight(a, s)[0] * _weight(b, t)[0]
-                one = _CONTROL + (row + b) * GRID + column + a
-                by_parameters[0, one], by_parameters[1, one + GRID * GRID] = weight * k[0], weight * k[1]
+                control = _CONTROL + (row + b) * GRID + column + a
+                by_parameters[0, at + control] = weight * k[0]
+                by_parameters[1, at + control + GRID * GRID] = weight * k[1]
 
 
 @kernel
 @no_type_check
-def camera_jacobian(model, k, x, y, z, pixel, by_point, by_parameters):
-    """Projection of a point in the camera frame, and its derivatives by the point (2x3) and by the parameters (2xn);
-    columns of the latter beyond those of the model are zero.
+def project(model, k, x, y, z):
+    """Pixel of a point in the camera frame; before a perspective camera z must be positive."""
+    u, v = _ideal(model, x, y, z)
+    xd, yd = distort(model, k, u, v)
+    return k[0] * xd + k[2], k[1] * yd + k[3]
+
+
+@kernel
+@no_type_check
+def point_jacobian(model, k, x, y, z, by_point):
+    """Projection of a point in the camera frame, and its derivatives by the point (2x3).
 
     ``k`` is (fx, fy, cx, cy, ...); before a perspective camera z must be positive.
     """
     fx, fy = k[0], k[1]
     u, v = _ideal(model, x, y, z)
     xd, yd = distort(model, k, u, v)
-    pixel[0], pixel[1] = fx * xd + k[2], fy * yd + k[3]
     xu, xv, yu, yv = _ideal_derivatives(model, k, u, v)
     if model <= _FULL_OPENCV:
         by_point[0, 0], by_point[0, 1] = fx * xu / z, fx * xv / z
@@ -202,32 +210,43 @@ def camera_jacobian(model, k, x, y, z, pixel, by_point, by_parameters):
         by_point[1, 0], by_point[1, 1] = fy * (yu * ux + yv * uy), fy * (yu * uy + yv * vy)
         by_point[0, 2] = -fx * (xu * x + xv * y) / away2
         by_point[1, 2] = -fy * (yu * x + yv * y) / away2
-    by_parameters[:] = 0
-    by_parameters[0, 0], by_parameters[1, 1] = xd, yd
-    by_parameters[0, 2], by_parameters[1, 3] = 1, 1
+    return fx * xd + k[2], fy * yd + k[3]
+
+
+@kernel
+@no_type_check
+def parameter_jacobian(model, k, x, y, z, by_parameters, at):
+    """Derivatives of the projection of a point by the parameters, in the columns of ``by_parameters`` from ``at`` on;
+    zero beyond those of the model."""
+    fx, fy = k[0], k[1]
+    u, v = _ideal(model, x, y, z)
+    for column in range(at, at + len(k)):
+        by_parameters[0, column] = by_parameters[1, column] = 0.0
+    by_parameters[0, at], by_parameters[1, at + 1] = distort(model, k, u, v)
+    by_parameters[0, at + 2], by_parameters[1, at + 3] = 1.0, 1.0
     r2 = u * u + v * v
     radial, _, divided = _radial(model, k, r2)
     a, b = fx * u * r2 / divided, fy * v * r2 / divided
-    by_parameters[0, 4], by_parameters[1, 4] = a, b
-    by_parameters[0, 5], by_parameters[1, 5] = a * r2, b * r2
+    by_parameters[0, at + 4], by_parameters[1, at + 4] = a, b
+    by_parameters[0, at + 5], by_parameters[1, at + 5] = a * r2, b * r2
     if model in (_OPENCV_FISHEYE, _SPLINED):
-        by_parameters[0, 6], by_parameters[1, 6] = a * r2 * r2, b * r2 * r2
-        by_parameters[0, 7], by_parameters[1, 7] = a * r2 * r2 * r2, b * r2 * r2 * r2
+        by_parameters[0, at + 6], by_parameters[1, at + 6] = a * r2 * r2, b * r2 * r2
+        by_parameters[0, at + 7], by_parameters[1, at + 7] = a * r2 * r2 * r2, b * r2 * r2 * r2
         if model == _SPLINED:
-            _control_derivatives(k, u, v, by_parameters)
+            _control_derivatives(k, u, v, by_parameters, at)
         return
-    by_parameters[0, 6], by_parameters[1, 6] = fx * 2 * u * v, fy * (r2 + 2 * v * v)
-    by_parameters[0, 7], by_parameters[1, 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v
+    by_parameters[0, at + 6], by_parameters[1, at + 6] = fx * 2 * u * v, fy * (r2 + 2 * v * v)
+    by_parameters[0, at + 7], by_parameters[1, at + 7] = fx * (r2 + 2 * u * u), fy * 2 * u * v
     if model == _OPENCV:
         return
-    by_parameters[0, 8], by_parameters[1, 8] = a * r2 * r2, b * r2 * r2
+    by_parameters[0, at + 8], by_parameters[1, at + 8] = a * r2 * r2, b * r2 * r2
     if model == _FULL_OPENCV:
         for power in range(3):
-            by_parameters[0, 9 + power], by_parameters[1, 9 + power] = -radial * a, -radial * b
+            by_parameters[0, at + 9 + power], by_parameters[1, at + 9 + power] = -radial * a, -radial * b
             a, b = a * r2, b * r2
         return
-    by_parameters[0, 9], by_parameters[1, 9] = a * r2 * r2 * r2, b * r2 * r2 * r2
-    by_parameters[0, 10], by_parameters[1, 11] = fx * r2, fy * r2
+    by_parameters[0, at + 9], by_parameters[1, at + 9] = a * r2 * r2 * r2, b * r2 * r2 * r2
+    by_parameters[0, at + 10], by_parameters[1, at + 11] = fx * r2, fy * r2
 
 
 @kernel
@@ -240,20 +259,19 @@ def _project_points(model, k, limit, points, out):
             continue
         u, v = _ideal(model, x, y, z)
         if u * u + v * v <= limit * limit:
-            xd, yd = distort(model, k, u, v)
-            out[n, 0], out[n, 1] = xd * k[0] + k[2], yd * k[1] + k[3]
+            out[n, 0], out[n, 1] = project(model, k, x, y, z)
 
 
 @kernel
 @no_type_check
 def _derivatives(model, k, points, by_point, by_parameters):
-    pixel = np.zeros(2)
     for n in range(points.shape[0]):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         if model <= _FULL_OPENCV and not z > 0:
             by_point[n], by_parameters[n] = np.nan, np.nan
         else:
-            camera_jacobian(model, k, x, y, z, pixel, by_point[n], by_parameters[n])
+            point_jacobian(model, k, x, y, z, by_point[n])
+            parameter_jacobian(model, k, x, y, z, by_parameters[n], 0)
 
 
 @kernel

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from cuspid.geometry.cameras import MODELS, camera_jacobian
+from cuspid.geometry.cameras import MODELS, parameter_jacobian, point_jacobian, project
 from cuspid.runtime.kernels import kernel
 from cuspid.runtime.workers import map_slices
 
@@ -85,20 +85,27 @@ class System(NamedTuple):
 
 @kernel
 @no_type_check
-def _move(rotation, translation, x, out):
-    """out = rotation @ x + translation."""
+def _move(rotations, translations, which, x, out):
+    """out = rotations[which] @ x + translations[which]; no slices: each would count a reference."""
     for i in range(3):
-        out[i] = rotation[i, 0] * x[0] + rotation[i, 1] * x[1] + rotation[i, 2] * x[2] + translation[i]
+        out[i] = (
+            rotations[which, i, 0] * x[0]
+            + rotations[which, i, 1] * x[1]
+            + rotations[which, i, 2] * x[2]
+            + translations[which, i]
+        )
 
 
-@kernel
+@kernel(inline="always")
 @no_type_check
 def _place(state, point, frame, camera, row, x_at, x_in_rig):
     """A point in the rig at the instant of a frame, and when a row was exposed; how many frames later that was."""
-    _move(state.frame_rotation[frame], state.frame_translation[frame], state.points[point], x_at)
-    delay, readout, height = state.shutters[camera]
-    late = delay + readout * (row / height - 0.5)
-    x_in_rig[:] = x_at
+    for i in range(3):
+        x_in_rig[i] = state.points[point, i]
+    _move(state.frame_rotation, state.frame_translation, frame, x_in_rig, x_at)
+    late = state.shutters[camera, 0] + state.shutters[camera, 1] * (row / state.shutters[camera, 2] - 0.5)
+    for i in range(3):
+        x_in_rig[i] = x_at[i]
     if late != 0:
         motion = state.motions[frame]
         for i in range(3):
@@ -125,33 +132,37 @@ def _is_before(model, x_in_cam):
 
 @kernel
 @no_type_check
-def _times(a, b, out):
-    """out (2xn) = a (2x3) @ b (3xn)."""
+def _times(a, rotations, which, out):
+    """out (2x3) = a (2x3) @ rotations[which]."""
     for i in range(2):
-        for j in range(b.shape[1]):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-
-
-@kernel
-@no_type_check
-def _times_motion(a, x, out):
-    """out (2x6): a (2x3) times the derivative [-[x]_x, I] of x under a small motion on its left."""
-    for i in range(2):
-        out[i, 0] = a[i, 2] * x[1] - a[i, 1] * x[2]
-        out[i, 1] = a[i, 0] * x[2] - a[i, 2] * x[0]
-        out[i, 2] = a[i, 1] * x[0] - a[i, 0] * x[1]
-        out[i, 3], out[i, 4], out[i, 5] = a[i, 0], a[i, 1], a[i, 2]
-
-
-@kernel
-@no_type_check
-def _times_shutter(by_rig, motion, x, below, out):
-    """out (2x2): derivatives by the delay and the readout of a camera, for a row so far below the middle."""
-    for i in range(2):
-        out[i, 0] = 0.0
         for j in range(3):
-            out[i, 0] += by_rig[i, j] * _velocity(motion, x, j)
-        out[i, 1] = below * out[i, 0]
+            out[i, j] = (
+                a[i, 0] * rotations[which, 0, j] + a[i, 1] * rotations[which, 1, j] + a[i, 2] * rotations[which, 2, j]
+            )
+
+
+@kernel
+@no_type_check
+def _times_motion(a, x, out, at):
+    """Columns ``at`` to ``at + 6`` of out: a (2x3) times the derivative [-[x]_x, I] of x under a small motion on its
+    left."""
+    for i in range(2):
+        out[i, at] = a[i, 2] * x[1] - a[i, 1] * x[2]
+        out[i, at + 1] = a[i, 0] * x[2] - a[i, 2] * x[0]
+        out[i, at + 2] = a[i, 1] * x[0] - a[i, 0] * x[1]
+        out[i, at + 3], out[i, at + 4], out[i, at + 5] = a[i, 0], a[i, 1], a[i, 2]
+
+
+@kernel
+@no_type_check
+def _times_shutter(by_rig, motion, x, below, out, at):
+    """Two columns of out from ``at`` on: derivatives by the delay and the readout of a camera, for a row so far below
+    the middle."""
+    for i in range(2):
+        out[i, at] = 0.0
+        for j in range(3):
+            out[i, at] += by_rig[i, j] * _velocity(motion, x, j)
+        out[i, at + 1] = below * out[i, at]
 
 
 @kernel
@@ -165,35 +176,54 @@ def _times_turn(by_rig, late, motion):
         by_rig[i, 2] += late * (a * motion[1] - b * motion[0])
 
 
-@kernel
+@kernel(inline="always")
 @no_type_check
-def linearise(state, point, frame, camera, row, calibrated, scratch, pixel, jacobian):
-    """Projected pixel, seen at the height ``row``, and its derivatives (2xn) by point, pose and whitened calibration;
-    the motion in the frame is held. False behind the camera."""
-    x_at, x_in_rig, x_in_cam, by_cam, by_rig, raw = scratch
+def _linearise_point(state, point, frame, camera, row, scratch, pixel, jacobian):
+    """Projected pixel, seen at the height ``row``, and its derivatives by the point; the motion in the frame is held.
+    False behind the camera; otherwise ``scratch`` keeps what leads there."""
+    x_at, x_in_rig, x_in_cam, by_cam, by_rig, _ = scratch
     late = _place(state, point, frame, camera, row, x_at, x_in_rig)
-    _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
+    _move(state.camera_rotation, state.camera_translation, camera, x_in_rig, x_in_cam)
     model = state.models[camera]
     if not _is_before(model, x_in_cam):
         return False
     x, y, z = x_in_cam
-    camera_jacobian(model, state.intrinsics[camera], x, y, z, pixel, by_cam, raw[:, POSE:])
-    _times(by_cam, state.camera_rotation[camera], by_rig)
-    if calibrated:
-        _times_motion(by_cam, x_in_cam, raw[:, :POSE])
-        if raw.shape[1] > POSE + state.intrinsics.shape[1]:
-            _times_shutter(by_rig, state.motions[frame], x_at, row / state.shutters[camera, 2] - 0.5, raw[:, -2:])
+    pixel[0], pixel[1] = point_jacobian(model, state.intrinsics[camera], x, y, z, by_cam)
+    _times(by_cam, state.camera_rotation, camera, by_rig)
     if late != 0:
         _times_turn(by_rig, late, state.motions[frame])
-    _times(by_rig, state.frame_rotation[frame], jacobian[:, :3])
-    _times_motion(by_rig, x_at, jacobian[:, 3 : 3 + POSE])
-    if calibrated:
-        for i in range(2):
-            for j in range(raw.shape[1]):
-                total = 0.0
-                for k in range(raw.shape[1]):
-                    total += raw[i, k] * state.basis[camera, k, j]
-                jacobian[i, 3 + POSE + j] = total
+    _times(by_rig, state.frame_rotation, frame, jacobian)
+    return True
+
+
+@kernel(inline="always")
+@no_type_check
+def linearise(state, point, frame, camera, row, calibrated, scratch, pixel, jacobian):
+    """Projected pixel, seen at the height ``row``, and its derivatives (2xn) by point, pose and whitened calibration;
+    the motion in the frame is held. False behind the camera."""
+    if not _linearise_point(state, point, frame, camera, row, scratch, pixel, jacobian):
+        return False
+    x_at, _, x_in_cam, by_cam, by_rig, raw = scratch
+    _times_motion(by_rig, x_at, jacobian, 3)
+    if not calibrated:
+        return True
+    numbers, lens = raw.shape[1], state.intrinsics.shape[1]
+    x, y, z = x_in_cam
+    _times_motion(by_cam, x_in_cam, raw, 0)
+    parameter_jacobian(state.models[camera], state.intrinsics[camera], x, y, z, raw, POSE)
+    if numbers > POSE + lens:
+        _times(by_cam, state.camera_rotation, camera, by_rig)
+        below = row / state.shutters[camera, 2] - 0.5
+        _times_shutter(by_rig, state.motions[frame], x_at, below, raw, POSE + lens)
+    # The basis has one block for the place of the camera, and one for its lens and shutter.
+    first = np.uint64(3 + POSE)
+    for i in range(2):
+        for j in range(np.uint64(numbers)):
+            jacobian[i, first + j] = 0.0
+        for k in range(numbers):
+            begin, end = (np.uint64(0), np.uint64(POSE)) if k < POSE else (np.uint64(POSE), np.uint64(numbers))
+            for j in range(begin, end):
+                jacobian[i, first + j] += raw[i, k] * state.basis[camera, k, j]
     return True
 
 
@@ -208,23 +238,26 @@ def pose_equations(models, lenses, rotations, translations, pose, points, pixels
     """
     matrix, gradient, within = np.zeros((POSE, POSE)), np.zeros(POSE), 0
     x_in_rig, x_in_cam, by_cam, by_rig = np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros((2, 3))
-    pixel, by_lens, by_pose = np.zeros(2), np.zeros((2, lenses.shape[1])), np.zeros((2, POSE))
+    by_pose = np.zeros((2, POSE))
     for o in range(len(points)):
         camera = cameras[o]
-        _move(pose[0], pose[1], points[o], x_in_rig)
-        _move(rotations[camera], translations[camera], x_in_rig, x_in_cam)
+        for i in range(3):
+            x_in_rig[i] = (
+                pose[0][i, 0] * points[o, 0] + pose[0][i, 1] * points[o, 1] + pose[0][i, 2] * points[o, 2] + pose[1][i]
+            )
+        _move(rotations, translations, camera, x_in_rig, x_in_cam)
         if not _is_before(models[camera], x_in_cam):
             continue
         x, y, z = x_in_cam
-        camera_jacobian(models[camera], lenses[camera], x, y, z, pixel, by_cam, by_lens)
-        x, y = pixel[0] - pixels[o, 0], pixel[1] - pixels[o, 1]
+        x, y = point_jacobian(models[camera], lenses[camera], x, y, z, by_cam)
+        x, y = x - pixels[o, 0], y - pixels[o, 1]
         left = 1 - (x * x + y * y) / limit_px**2
         if not left > 0:
             continue
         within += 1
         weight = left * left / (1 + x * x + y * y)
-        _times(by_cam, rotations[camera], by_rig)
-        _times_motion(by_rig, x_in_rig, by_pose)
+        _times(by_cam, rotations, camera, by_rig)
+        _times_motion(by_rig, x_in_rig, by_pose, 0)
         for i in range(POSE):
             gradient[i] += weight * (by_pose[0, i] * x + by_pose[1, i] * y)
             for j in range(POSE):
@@ -249,26 +282,26 @@ def _columns(state):
 
 @kernel
 @no_type_check
-def _residuals(state, observations, out):
-    """Projected minus observed pixel for each observation; NaN behind the camera."""
-    x_at, x_in_rig, x_in_cam, by_cam, _, raw = make_scratch(state)
-    for point in range(observations.start.shape[0] - 1):
+def _residuals(state, observations, first, last, out):
+    """Projected minus observed pixel for each observation of the points ``first`` to ``last``; NaN behind the
+    camera."""
+    x_at, x_in_rig, x_in_cam = np.zeros(3), np.zeros(3), np.zeros(3)
+    for point in range(first, last):
         for o in range(observations.start[point], observations.start[point + 1]):
             frame, camera = observations.frame[o], observations.camera[o]
             _place(state, point, frame, camera, observations.pixels[o, 1], x_at, x_in_rig)
-            _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
-            out[o] = np.nan
+            _move(state.camera_rotation, state.camera_translation, camera, x_in_rig, x_in_cam)
+            out[o, 0] = out[o, 1] = np.nan
             model = state.models[camera]
             if _is_before(model, x_in_cam):
-                x, y, z = x_in_cam
-                camera_jacobian(model, state.intrinsics[camera], x, y, z, out[o], by_cam, raw[:, POSE:])
-                out[o] -= observations.pixels[o]
+                x, y = project(model, state.intrinsics[camera], x_in_cam[0], x_in_cam[1], x_in_cam[2])
+                out[o, 0], out[o, 1] = x - observations.pixels[o, 0], y - observations.pixels[o, 1]
 
 
 # --- normal equations --------------------------------------------------------------------------------------------
 
 
-@kernel
+@kernel(inline="always")
 @no_type_check
 def _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
     """Residual and Jacobian of an observation, scaled by the root of its weight. False behind the camera."""
@@ -276,13 +309,15 @@ def _weigh(state, observations, weighting, point, o, scratch, residual, jacobian
     row = observations.pixels[o, 1]
     if not linearise(state, point, frame, camera, row, weighting.calibrated, scratch, residual, jacobian):
         return False
-    residual -= observations.pixels[o]
-    scale = 1 / weighting.sigma_px
-    length = np.hypot(residual[0], residual[1]) * scale
+    x, y, scale = residual[0] - observations.pixels[o, 0], residual[1] - row, 1 / weighting.sigma_px
+    length = np.hypot(x, y) * scale
     if length > weighting.huber_sigmas:
         scale *= np.sqrt(weighting.huber_sigmas / length)
-    residual *= scale
-    jacobian *= scale
+    residual[0], residual[1] = x * scale, y * scale
+    # No array expressions: each would take longer than the loop.
+    for i in range(2):
+        for j in range(jacobian.shape[1]):
+            jacobian[i, j] *= scale
     return True
 
 
@@ -316,7 +351,7 @@ def _add_gradient(system, offset, by_block, residual):
         system.diagonal[offset + i] += by_block[0, i] ** 2 + by_block[1, i] ** 2
 
 
-@kernel
+@kernel(inline="always")
 @no_type_check
 def _add_observation(system, blocks, jacobian, residual, pose_at, camera_at):
     """Add an observation to the direct part of the system and to the coupling of its blocks with the point."""
@@ -328,13 +363,13 @@ def _add_observation(system, blocks, jacobian, residual, pose_at, camera_at):
         _add_gradient(system, pose_at, by_pose, residual)
         slot, count = _slot(offsets, count, pose_at, coupling)
         widths[slot] = POSE
-        _add_block(coupling[slot], 0, 0, by_pose, by_point)
+        _add_block(coupling[slot], 0, 0, by_point, by_pose)
     if camera_at >= 0:
         _add_block(system.matrix, camera_at, camera_at, by_calibration, by_calibration)
         _add_gradient(system, camera_at, by_calibration, residual)
         slot, count = _slot(offsets, count, camera_at, coupling)
         widths[slot] = by_calibration.shape[1]
-        _add_block(coupling[slot], 0, 0, by_calibration, by_point)
+        _add_block(coupling[slot], 0, 0, by_point, by_calibration)
         if pose_at >= 0:
             _add_block(system.matrix, camera_at, pose_at, by_calibration, by_pose)
     return count
@@ -347,7 +382,7 @@ def _eliminate(system, offsets, widths, coupling, count, inverse, point_gradient
     for a in range(count):
         for i in range(widths[a]):
             row = offsets[a] + i
-            w0, w1, w2 = coupling[a, i, 0], coupling[a, i, 1], coupling[a, i, 2]
+            w0, w1, w2 = coupling[a, 0, i], coupling[a, 1, i], coupling[a, 2, i]
             y0 = w0 * inverse[0, 0] + w1 * inverse[1, 0] + w2 * inverse[2, 0]
             y1 = w0 * inverse[0, 1] + w1 * inverse[1, 1] + w2 * inverse[2, 1]
             y2 = w0 * inverse[0, 2] + w1 * inverse[1, 2] + w2 * inverse[2, 2]
@@ -355,9 +390,11 @@ def _eliminate(system, offsets, widths, coupling, count, inverse, point_gradient
             for b in range(count):
                 if offsets[b] > offsets[a]:
                     continue
-                for j in range(widths[b]):
-                    system.matrix[row, offsets[b] + j] -= (
-                        y0 * coupling[b, j, 0] + y1 * coupling[b, j, 1] + y2 * coupling[b, j, 2]
+                # Unsigned: numba would look for negative indices otherwise.
+                first = np.uint64(offsets[b])
+                for j in range(np.uint64(widths[b])):
+                    system.matrix[row, first + j] -= (
+                        y0 * coupling[b, 0, j] + y1 * coupling[b, 1, j] + y2 * coupling[b, 2, j]
                     )
 
 
@@ -394,7 +431,7 @@ def _accumulate(state, observations, weighting, first, last, system):
     longest, calibration = np.diff(observations.start).max(), state.basis.shape[1]
     scratch, residual, jacobian = make_scratch(state), np.zeros(2), np.zeros((2, _columns(state)))
     offsets, widths = np.zeros(2 * longest, np.int64), np.zeros(2 * longest, np.int64)
-    coupling = np.zeros((2 * longest, max(calibration, POSE), 3))
+    coupling = np.zeros((2 * longest, 3, max(calibration, POSE)))
     hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
     for point in range(first, last):
         hessian[:], gradient[:] = 0, 0
@@ -461,24 +498,26 @@ def _add_products(left, right, out):
             out[d] += left[k] * right[k, d]
 
 
-@kernel
+@kernel(inline="always")
 @no_type_check
-def _loss(state, observations, weighting, point, scratch, residual):
-    """Huber loss of the observations of a point; infinite where it lies behind one of their cameras."""
-    x_at, x_in_rig, x_in_cam, by_cam, _, raw = scratch
-    total = 0.0
+def _point_equations(state, observations, weighting, point, scratch, residual, jacobian, hessian, gradient):
+    """Normal equations of a point alone, the rest being held, and the Huber loss of its observations: infinite where it
+    lies behind one of their cameras."""
+    hessian[:], gradient[:] = 0, 0
+    total, knee = 0.0, weighting.huber_sigmas
     for o in range(observations.start[point], observations.start[point + 1]):
-        frame, camera = observations.frame[o], observations.camera[o]
-        _place(state, point, frame, camera, observations.pixels[o, 1], x_at, x_in_rig)
-        _move(state.camera_rotation[camera], state.camera_translation[camera], x_in_rig, x_in_cam)
-        model = state.models[camera]
-        if not _is_before(model, x_in_cam):
-            return np.inf
-        x, y, z = x_in_cam
-        camera_jacobian(model, state.intrinsics[camera], x, y, z, residual, by_cam, raw[:, POSE:])
-        residual -= observations.pixels[o]
-        length, knee = np.hypot(residual[0], residual[1]) / weighting.sigma_px, weighting.huber_sigmas
+        frame, camera, row = observations.frame[o], observations.camera[o], observations.pixels[o, 1]
+        if not _linearise_point(state, point, frame, camera, row, scratch, residual, jacobian):
+            total = np.inf
+            continue
+        x, y = residual[0] - observations.pixels[o, 0], residual[1] - row
+        length = np.hypot(x, y) / weighting.sigma_px
         total += length * length if length <= knee else 2 * knee * length - knee * knee
+        weight = 1.0 if length <= knee else knee / length
+        for i in range(3):
+            gradient[i] += weight * (jacobian[0, i] * x + jacobian[1, i] * y)
+            for j in range(3):
+                hessian[i, j] += weight * (jacobian[0, i] * jacobian[0, j] + jacobian[1, i] * jacobian[1, j])
     return total
 
 
@@ -486,28 +525,27 @@ def _loss(state, observations, weighting, point, scratch, residual):
 @no_type_check
 def _settle(state, observations, weighting, first, last):
     """Move the points ``first`` to ``last`` to where their rays meet, the rest being held (Gauss-Newton)."""
-    scratch, residual, jacobian = make_scratch(state), np.zeros(2), np.zeros((2, _columns(state)))
-    hessian, gradient, inverse = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 3))
-    before = np.zeros(3)
+    scratch, residual, jacobian = make_scratch(state), np.zeros(2), np.zeros((2, 3))
+    hessian, gradient, inverse, before = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros(3)
     for point in range(first, last):
-        loss = _loss(state, observations, weighting, point, scratch, residual)
-        for _ in range(_SETTLING):
-            hessian[:], gradient[:], before[:] = 0, 0, state.points[point]
-            for o in range(observations.start[point], observations.start[point + 1]):
-                if _weigh(state, observations, weighting, point, o, scratch, residual, jacobian):
-                    _add_block(hessian, 0, 0, jacobian[:, :3], jacobian[:, :3])
-                    _add_block(gradient, 0, 0, jacobian[:, :3], residual.reshape(2, 1))
+        loss = np.inf
+        for step in range(_SETTLING + 1):
+            lower = _point_equations(
+                state, observations, weighting, point, scratch, residual, jacobian, hessian, gradient
+            )
+            if step > 0 and not lower < loss:
+                for i in range(3):
+                    state.points[point, i] = before[i]
+                break
+            if step == _SETTLING or (step > 0 and loss - lower < 1e-9 * lower):
+                break
+            loss = lower
             _point_inverse(hessian, inverse)
             for i in range(3):
+                before[i] = state.points[point, i]
+            for i in range(3):
                 for j in range(3):
-                    state.points[point, i] -= inverse[i, j] * gradient[j, 0]
-            lower = _loss(state, observations, weighting, point, scratch, residual)
-            if not lower < loss:
-                state.points[point] = before
-                break
-            gained, loss = loss - lower, lower
-            if gained < 1e-9 * loss:
-                break
+                    state.points[point, i] -= inverse[i, j] * gradient[j]
 
 
 def normal_equations(state: State, observations: Observations, weighting: Weighting) -> System:
@@ -592,10 +630,9 @@ def substitute(
 def refine_points(state: State, observations: Observations, weighting: Weighting) -> State:
     """The state with each point where its rays meet best, with poses and calibration held fixed."""
     settled = state._replace(points=state.points.copy())
-    held = weighting._replace(calibrated=False)
 
     def part(points: slice) -> None:
-        _settle(settled, observations, held, points.start, points.stop)
+        _settle(settled, observations, weighting, points.start, points.stop)
 
     map_slices(part, len(state.points), _PARTS, few=_FEW)
     return settled
@@ -604,5 +641,9 @@ def refine_points(state: State, observations: Observations, weighting: Weighting
 def residual_vectors(state: State, observations: Observations) -> Float[np.ndarray, "o 2"]:
     """Projected minus observed pixels; NaN behind the camera."""
     residuals = np.empty_like(observations.pixels)
-    _residuals(state, observations, residuals)
+
+    def part(points: slice) -> None:
+        _residuals(state, observations, points.start, points.stop, residuals)
+
+    map_slices(part, len(state.points), _PARTS, few=_FEW)
     return residuals
