@@ -170,13 +170,22 @@ def detail_px(image: Float[np.ndarray, "h w"], noise_dn: float) -> float:
 
 def _mean_squared_difference(image: Float[np.ndarray, "h w"], distance: int) -> float:
     """Of pixels so far apart in their row or column, neither of them dark; 0 if there are none."""
-    total, count = 0.0, 0
     dark = min(_DARK_DN, _DARK_SHARE * float(np.quantile(image[::5, ::5], 0.99)))
-    for each in (image, image.T):
-        here, there = each[distance:], each[:-distance]
-        lit = (here > dark) & (there > dark)
-        total += float(((here - there)[lit] ** 2).sum(dtype=np.float64))
-        count += int(lit.sum())
+    return float(_mean_squared_step(image, distance, dark))
+
+
+@kernel
+@no_type_check
+def _mean_squared_step(image, distance, dark):
+    total, count = 0.0, 0
+    rows, columns = image.shape
+    for rows_off, columns_off in ((distance, 0), (0, distance)):
+        for i in range(rows - rows_off):
+            for j in range(columns - columns_off):
+                here, there = image[i + rows_off, j + columns_off], image[i, j]
+                if here > dark and there > dark:
+                    total += (here - there) * (here - there)
+                    count += 1
     return total / max(count, 1)
 
 

@@ -20,11 +20,11 @@ PACKAGE = "cuspid"
 
 def meaning(text: bytes) -> str:
     """The statements of a module without what people only read."""
-    return ast.dump(_statements(text))
+    return ast.dump(_without_texts(ast.parse(text)))
 
 
-def _statements(text: bytes) -> ast.Module:
-    tree = ast.parse(text)
+def _without_texts(tree: ast.Module) -> ast.Module:
+    """The tree itself, from which they are taken."""
     for body in _bodies(tree):
         body[:] = [statement for statement in body if not _is_text(statement)]
     return tree
@@ -42,17 +42,21 @@ def _is_text(statement: ast.AST) -> bool:
     return isinstance(constant, ast.Constant) and isinstance(constant.value, str)
 
 
-@cache
-def _imports(text: bytes) -> frozenset[tuple[str, str]]:
+def _imports(tree: ast.Module) -> frozenset[tuple[str, str]]:
     """What a module imports, wherever in it: the other module, and the name that is taken from it, empty for all of it.
     What is used as ``cuspid.name`` is taken from there."""
     found = set[tuple[str, str]]()
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
             found |= {_imported_name(node, alias) for alias in node.names}
         elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == PACKAGE:
             found.add((PACKAGE, node.attr))
     return frozenset(found)
+
+
+@cache
+def _parsed_imports(text: bytes) -> frozenset[tuple[str, str]]:
+    return _imports(ast.parse(text))
 
 
 def _imported_name(statement: ast.Import | ast.ImportFrom, alias: ast.alias) -> tuple[str, str]:
@@ -87,7 +91,7 @@ class Code:
             module = waiting.pop()
             if module not in found and not self._is_left_out(module):
                 found.add(module)
-                named = (self._source(*each) for each in _imports(self._read_source(module)))
+                named = (self._source(*each) for each in _parsed_imports(self._read_source(module)))
                 waiting += [each[0] for each in named if each is not None and each[0]]
         return frozenset(found)
 
@@ -106,12 +110,13 @@ class Code:
         return text
 
     def _digest(self, text: bytes) -> str:
-        tree = _statements(text)
-        for body in [*_bodies(tree)]:
+        tree = ast.parse(text)
+        imported = _imports(tree)
+        for body in [*_bodies(_without_texts(tree))]:
             brought: list[tuple[str, str, str]] = []
             body[:] = [rest for statement in body if (rest := self._strip_own_imports(statement, brought)) is not None]
             body.insert(0, ast.Expr(ast.Constant(repr(sorted(brought)))))
-        used = sorted(self._brought(PACKAGE, *each) for each in _imports(text) if each[0] == PACKAGE)
+        used = sorted(self._brought(PACKAGE, *each) for each in imported if each[0] == PACKAGE)
         return hashlib.sha256(f"{used} {ast.dump(tree)}".encode()).hexdigest()
 
     def _strip_own_imports(self, statement: ast.stmt, brought: list[tuple[str, str, str]]) -> ast.stmt | None:
