@@ -4,12 +4,11 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 BPY    := build/blender
-WHEEL  := build/wheel
 
 # Containers often ask Python to keep no bytecode. Each of the many processes of the tests would compile all modules.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-all lint format docs wheel benchmarks blender clean
+.PHONY: demo test test-all lint format docs benchmarks blender clean
 
 demo: $(STAMP)
 	$(BIN)/cuspid run --tooth 46 --out demo
@@ -40,20 +39,6 @@ docs: $(STAMP).docs
 	$(BIN)/sphinx-build --quiet --fail-on-warning --doctree-dir build/doctrees docs build/docs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m documentation tests/whole/test_docs.py tests/whole/test_examples.py
 	@echo "build/docs/index.html"
-
-# As users get it: in an environment of its own, far from the sources.
-wheel: $(STAMP)
-	rm -rf $(WHEEL)
-	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir $(WHEEL) . ./reproduction
-	$(PYTHON) -m venv $(WHEEL)/venv
-	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt $(WHEEL)/cuspid-*.whl
-	cd $(WHEEL) && venv/bin/cuspid rig build --design four --width-px 160 --height-px 160 --out probe
-	cd $(WHEEL) && venv/bin/cuspid run --handpiece probe/handpiece.json --tooth 46 --frames 6 --length-mm 3 --out scan
-	test -s $(WHEEL)/scan/report.html
-	cd $(WHEEL) && ! venv/bin/cuspid reproduce --no-run --out thesis
-	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --no-deps $(WHEEL)/cuspid_thesis-*.whl
-	cd $(WHEEL) && venv/bin/cuspid reproduce --no-run --out thesis
-	test -s $(WHEEL)/thesis/reproduction.html
 
 benchmarks: $(STAMP)
 	$(BIN)/python benchmarks/run.py --out benchmarks/results

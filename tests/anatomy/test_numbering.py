@@ -116,7 +116,7 @@ def test_a_map_says_what_labels_are(tmp_path: Path) -> None:
     for text, said in (("{}", "must hold"), ('{"x": 31}', "whole"), ('{"1": 50}', "between"), ('{"1": 20}', "not an")):
         (tmp_path / "map.json").write_text(text)
         with pytest.raises(InputError, match=f"map.json.*{said}"):
-            load_jaw(tmp_path / "jaw.ply", labelling=Labelling(label_map=tmp_path / "map.json"))
+            Labelling(label_map=tmp_path / "map.json").fdi(tmp_path / "jaw.ply", LOWER.face_labels, LOWER.mesh)
     (tmp_path / "map.json").write_text('{"101": 37}')
     with pytest.raises(InputError, match=r"jaw.ply: --label-map does not say what label 102 is"):
         load_jaw(tmp_path / "jaw.ply", labelling=Labelling(label_map=tmp_path / "map.json"))
