@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from builders import folder_capture, image_path, mottled
 from cuspid.geometry import Rigid3
 from cuspid.model.camera import Camera
-from cuspid.model.capture import Capture, ImageFolder, KeptImages
+from cuspid.model.capture import Capture
 from cuspid.model.rig import Handpiece, MountedCamera, Rig
 from cuspid.motion.frontend.features import (
     DESCRIPTOR_NORM,
@@ -25,6 +25,7 @@ from cuspid.motion.frontend.features import (
     select_evenly,
 )
 from cuspid.motion.frontend.pairs import match_unguided
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.runtime.errors import InputError, OutputError
 
 SIZE = 240
@@ -169,54 +170,54 @@ def test_all_images_are_read_once(capture: Capture, tmp_path: Path, monkeypatch:
     """A second run takes every image from the cache and finds the same; a changed option or image does not."""
     seen: list[tuple[str, int, int]] = []
     cache = tmp_path / "cache"
-    first = detect_all(capture, cache=cache, progress=lambda *step: seen.append(step))
+    first = detect_all(Pictures(capture), cache=cache, progress=lambda *step: seen.append(step))
     assert seen == [("features", k, 4) for k in (1, 2, 3, 4)]
     assert set(first) == {(f"{k:05d}", c) for k in (0, 1) for c in "ab"}
     reads: list[object] = []
     original = Capture.fine_image
     monkeypatch.setattr(Capture, "fine_image", lambda self, *which: reads.append(which) or original(self, *which))
-    again = detect_all(capture, cache=cache)
+    again = detect_all(Pictures(capture), cache=cache)
     assert not reads
     np.testing.assert_array_equal(again["00001", "b"].descriptors, first["00001", "b"].descriptors)
     np.testing.assert_array_equal(again["00001", "b"].pixels, first["00001", "b"].pixels)
     cv2.imwrite(str(image_path(capture, "00001", "b")), photograph(SECOND))
-    detect_all(capture, cache=cache)
+    detect_all(Pictures(capture), cache=cache)
     assert reads == [(capture.frames[1], "b")]
-    assert len(detect_all(capture, FeatureOptions(count=10), cache=cache)["00000", "a"]) == 10
+    assert len(detect_all(Pictures(capture), FeatureOptions(count=10), cache=cache)["00000", "a"]) == 10
 
 
-def test_images_are_decoded_once_as_far_as_memory_goes(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those that were kept and those that are read again are the same, and none can be changed."""
-    reads: list[tuple[str, str]] = []
-    original = ImageFolder.read
-    monkeypatch.setattr(ImageFolder, "read", lambda self, *which: reads.append(which) or original(self, *which))
-    every = [(frame.name, camera) for frame in capture.frames for camera in frame.cameras]
-    images = [capture.source.read(*each) for each in every]
-    for room, again in ((0, 4), (2, 2), (100, 0)):
-        kept = KeptImages(capture.source, max_bytes=room * images[0].nbytes)
-        for each in every:
-            kept.read(*each)
+def test_grey_pictures_are_read_once_as_far_as_memory_goes(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that were kept and those that are read again are the same."""
+    reads: list[tuple[object, ...]] = []
+    original = Capture.fine_image
+    monkeypatch.setattr(Capture, "fine_image", lambda self, *which: reads.append(which) or original(self, *which))
+    every = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
+    height, width = original(capture, *every[0]).shape[:2]
+    greys, counts = [], []
+    for room in (0, 2, 100):
+        pictures = Pictures(capture, max_bytes=room * height * width)
+        for image in every:
+            pictures.image(*image)
         reads.clear()
-        for each, image in zip(every, images, strict=True):
-            np.testing.assert_array_equal(kept.read(*each), image)
-        assert len(reads) == again
-        assert room < 100 or not kept.read(*every[0]).flags.writeable
-    held = capture.keep_images()
-    assert held.keep_images() is held
-    held.image(capture.frames[0], "a")
-    held.forget_images()
-    reads.clear()
-    held.image(capture.frames[0], "a")
-    assert reads == [("00000", "a")]
+        greys.append([pictures.grey(*image) for image in every])
+        counts.append(len(reads))
+    assert counts == [4, 2, 0]
+    for some in zip(*greys, strict=True):
+        assert some[0].shape == (height, width)
+        assert some[0].std() > 0
+        np.testing.assert_array_equal(some[0], some[1])
+        np.testing.assert_array_equal(some[0], some[2])
 
 
 def test_a_broken_cache_file_is_made_again(capture: Capture, tmp_path: Path) -> None:
     """A run that was killed while writing leaves nothing that a later one trusts."""
     cache = tmp_path / "cache"
-    first = detect_all(capture, cache=cache)
+    first = detect_all(Pictures(capture), cache=cache)
     file = cache / "features" / "a" / "00000.npz"
     file.write_bytes(file.read_bytes()[:500])
-    np.testing.assert_array_equal(detect_all(capture, cache=cache)["00000", "a"].pixels, first["00000", "a"].pixels)
+    np.testing.assert_array_equal(
+        detect_all(Pictures(capture), cache=cache)["00000", "a"].pixels, first["00000", "a"].pixels
+    )
 
 
 def test_bad_images_and_caches_are_told(capture: Capture, tmp_path: Path) -> None:
@@ -224,10 +225,10 @@ def test_bad_images_and_caches_are_told(capture: Capture, tmp_path: Path) -> Non
     blocked = tmp_path / "blocked"
     blocked.write_text("a file, not a folder")
     with pytest.raises(OutputError, match="blocked"):
-        detect_all(capture, cache=blocked)
+        detect_all(Pictures(capture), cache=blocked)
     image_path(capture, "00001", "a").unlink()
     with pytest.raises(InputError, match=r"a/00001\.png"):
-        detect_all(capture, cache=tmp_path / "cache")
+        detect_all(Pictures(capture), cache=tmp_path / "cache")
 
 
 def test_how_many_keypoints_follows_from_the_size_of_the_image() -> None:

@@ -18,6 +18,7 @@ from cuspid.motion.frontend.features import detect_all
 from cuspid.motion.frontend.least_squares_matching import LeastSquaresOptions
 from cuspid.motion.frontend.odometry import Edge, OdometryOptions, chain, polish, triangulate_frame
 from cuspid.motion.frontend.pairs import MatchingOptions, index_features
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.location import _advice, _loose_notes, locate_features, stereo_ties
 from cuspid.runtime.errors import ReconstructionError
 from keypoint_films import (
@@ -309,7 +310,7 @@ def test_where_no_patch_is_found_keypoints_are_taken(tmp_path: Path) -> None:
     rig = Rig({name: m for name, m in make_handpiece().rig.cameras.items() if name != "side"})
     path = {f"{k:05d}": Rigid3(np.eye(3), np.array([-0.6 * k, 0, 0])) for k in range(3)}
     capture = make_capture(tmp_path, rig, path)
-    seen = detect_all(capture, MotionOptions().features)
+    seen = detect_all(Pictures(capture), MotionOptions().features)
 
     def read(frame: str, camera: str) -> np.ndarray:
         image = capture.source.read(frame, camera)[..., 0]

@@ -159,7 +159,7 @@ def _simulate(mesh: Path | None, out: Path, source: Source, probe: Probe, option
 
 def reconstruct_capture(capture: Capture, out: Path, options: ReconstructionOptions, model: Path | None = None) -> None:
     """Reconstruct and print a summary. ``model``: a COLMAP model, whose poses are taken."""
-    settings, capture = {"reconstruction": options, "from_poses": model}, capture.keep_images()
+    settings = {"reconstruction": options, "from_poses": model}
     inputs = storage.hash_capture(capture) | ({} if model is None else {"poses": hash_model(model)})
     with storage.claimed_folder(out, "reconstruct", settings, inputs):
         options = replace(options, signal=pipeline.resolve_signal(capture, options))

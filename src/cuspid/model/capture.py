@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from cuspid.geometry import freeze
 from cuspid.model.rig import Handpiece
 from cuspid.runtime.display import Displayed
 from cuspid.runtime.errors import InputError
@@ -165,8 +164,8 @@ class ImageFolder:
 
 
 @dataclass(frozen=True)
-class DerivedImages:
-    """Images made from those of another source, here just the same. An :class:`ImageSource`."""
+class HalvedImages:
+    """The images of another source at half their size. An :class:`ImageSource`."""
 
     whole: ImageSource
     """The other source."""
@@ -175,31 +174,6 @@ class DerivedImages:
     def suffix(self) -> str:
         """As :attr:`ImageSource.suffix`."""
         return self.whole.suffix
-
-    def read(self, frame: str, camera: str) -> Pixels:
-        """As :meth:`ImageSource.read`."""
-        return self.whole.read(frame, camera)
-
-    def size(self, frame: str, camera: str) -> tuple[int, int]:
-        """As :meth:`ImageSource.size`."""
-        return self.whole.size(frame, camera)
-
-    def mask(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w"] | None:
-        """As :meth:`ImageSource.mask`."""
-        return self.whole.mask(frame, camera)
-
-    def digest(self, frame: str, camera: str) -> str:
-        """As :meth:`ImageSource.digest`."""
-        return self.whole.digest(frame, camera)
-
-    def where(self, frame: str, camera: str) -> str:
-        """As :meth:`ImageSource.where`."""
-        return self.whole.where(frame, camera)
-
-
-@dataclass(frozen=True)
-class HalvedImages(DerivedImages):
-    """The images of another source at half their size."""
 
     def read(self, frame: str, camera: str) -> Pixels:
         """As :meth:`ImageSource.read`."""
@@ -219,28 +193,13 @@ class HalvedImages(DerivedImages):
         size = halved_size(mask.shape[1], mask.shape[0])
         return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
 
+    def digest(self, frame: str, camera: str) -> str:
+        """As :meth:`ImageSource.digest`."""
+        return self.whole.digest(frame, camera)
 
-@dataclass(frozen=True)
-class KeptImages(DerivedImages):
-    """The images of another source, of which the first that are read stay in memory: to decode one takes as long as to
-    find its keypoints."""
-
-    max_bytes: int = 1_000_000_000
-    """Memory for the images that are kept, in bytes."""
-    _kept: dict[tuple[str, str], Pixels] = field(default_factory=dict, init=False, repr=False, compare=False)
-
-    def read(self, frame: str, camera: str) -> Pixels:
-        """As :meth:`ImageSource.read`; what is kept cannot be written to."""
-        image = self._kept.get((frame, camera))
-        if image is None:
-            image = freeze(self.whole.read(frame, camera).view())
-            if (len(self._kept) + 1) * image.nbytes <= self.max_bytes:
-                self._kept[frame, camera] = image
-        return image
-
-    def forget(self) -> None:
-        """Free the memory of what was kept."""
-        self._kept.clear()
+    def where(self, frame: str, camera: str) -> str:
+        """As :meth:`ImageSource.where`."""
+        return self.whole.where(frame, camera)
 
 
 def halved_size(width: int, height: int) -> tuple[int, int]:
@@ -269,15 +228,6 @@ class Capture(Displayed):
     def halved(self) -> Capture:
         """The same capture with images of half the size, and a handpiece that takes such images."""
         return replace(self, handpiece=self.handpiece.scaled(0.5), source=HalvedImages(self.source))
-
-    def keep_images(self) -> Capture:
-        """The same capture, whose images are decoded once, as far as memory allows (:class:`KeptImages`)."""
-        return self if isinstance(self.source, KeptImages) else replace(self, source=KeptImages(self.source))
-
-    def forget_images(self) -> None:
-        """Free the memory of the images that :meth:`keep_images` has kept."""
-        if isinstance(self.source, KeptImages):
-            self.source.forget()
 
     def image(self, frame: Frame, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """RGB image. Raises InputError where it is missing, damaged, or not of the camera's size."""

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.interpolate import RBFInterpolator
 
-from cuspid.model.capture import Capture, DerivedImages
+from cuspid.model.capture import Capture, ImageSource
 from cuspid.model.reconstruction import Reconstruction, Tracks
 from cuspid.model.rig import MountedCamera, Rig
 from cuspid.model.shutter import PLAIN, displace_points, film_times, motions
@@ -93,22 +93,33 @@ class Unrolling:
 
 
 @dataclass(frozen=True, eq=False)
-class UnrolledImages(DerivedImages):
-    """The images of another source, set right."""
+class UnrolledImages:
+    """The images of another source, set right. An :class:`ImageSource`."""
 
+    rolled: ImageSource
+    """The other source."""
     unrollings: Mapping[tuple[str, str], Unrolling]
     """By frame and camera; images without one stay as they are."""
 
+    @property
+    def suffix(self) -> str:
+        """As :attr:`ImageSource.suffix`."""
+        return self.rolled.suffix
+
     def read(self, frame: str, camera: str) -> Pixels:
         """As :meth:`ImageSource.read`."""
-        image, unrolling = self.whole.read(frame, camera), self.unrollings.get((frame, camera))
+        image, unrolling = self.rolled.read(frame, camera), self.unrollings.get((frame, camera))
         if unrolling is None:
             return image
         return np.asarray(cv2.remap(image, unrolling.map_px, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
+    def size(self, frame: str, camera: str) -> tuple[int, int]:
+        """As :meth:`ImageSource.size`."""
+        return self.rolled.size(frame, camera)
+
     def mask(self, frame: str, camera: str) -> UInt8[np.ndarray, "h w"] | None:
         """As :meth:`ImageSource.mask`; what the image did not show does not count."""
-        mask, unrolling = self.whole.mask(frame, camera), self.unrollings.get((frame, camera))
+        mask, unrolling = self.rolled.mask(frame, camera), self.unrollings.get((frame, camera))
         if unrolling is None:
             return mask
         whole = np.full(unrolling.map_px.shape[:2], 255, np.uint8) if mask is None else mask
@@ -116,8 +127,12 @@ class UnrolledImages(DerivedImages):
 
     def digest(self, frame: str, camera: str) -> str:
         """As :meth:`ImageSource.digest`."""
-        digest, unrolling = self.whole.digest(frame, camera), self.unrollings.get((frame, camera))
+        digest, unrolling = self.rolled.digest(frame, camera), self.unrollings.get((frame, camera))
         return digest if unrolling is None else f"{digest} {unrolling.digest}"
+
+    def where(self, frame: str, camera: str) -> str:
+        """As :meth:`ImageSource.where`."""
+        return self.rolled.where(frame, camera)
 
 
 def is_rolling(rig: Rig, frames: Sequence[str]) -> bool:

@@ -20,6 +20,7 @@ from cuspid.model.pairing import stereo_pairs
 from cuspid.motion.frontend.features import detect_all
 from cuspid.motion.frontend.odometry import search_range_mm
 from cuspid.motion.frontend.pairs import IndexedFeatures, match_guided
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.location import MotionOptions, index_frame
 from cuspid.runtime.progress import Progress, silent
 
@@ -35,7 +36,7 @@ def epipolar_offset_px(
     """Median distance of the matches of a pair of cameras from their epipolar lines, the largest over the pairs and
     frames; None where no pair has enough matches."""
     handpiece, frames = capture.handpiece, [frame.name for frame in capture.frames]
-    features = detect_all(capture, options.sought, progress=progress, cache=cache)
+    features = detect_all(Pictures(capture, max_bytes=0), options.sought, progress=progress, cache=cache)
     pairs = stereo_pairs(handpiece.rig, handpiece.working_distance_mm, options.pairing)
     within, offsets = replace(options.within, tolerance_px=_REACH_PX), list[float]()
     for views in (index_frame(handpiece.rig, features, name) for name in frames):

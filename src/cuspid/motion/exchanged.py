@@ -26,6 +26,7 @@ from cuspid.model.rig import Handpiece
 from cuspid.motion.frontend.features import Features, detect_all
 from cuspid.motion.frontend.odometry import Edge, relative_pose, triangulate_frame
 from cuspid.motion.frontend.pairs import match_unguided
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.location import MotionOptions, index_frame
 from cuspid.runtime.errors import InputError
 from cuspid.runtime.progress import Progress, silent
@@ -108,7 +109,7 @@ def check_cameras(
     first = max(0, (count - _FRAMES) // 2)
     few = replace(capture, frames=capture.frames[first : first + _FRAMES])
     names = [frame.name for frame in few.frames]
-    features = detect_all(few, options.sought, progress=progress, cache=cache)
+    features = detect_all(Pictures(few, max_bytes=0), options.sought, progress=progress, cache=cache)
     return check_features(handpiece, features, names, options)
 
 

@@ -33,9 +33,9 @@ from cuspid.motion.frontend.odometry import (
     triangulate_frame,
 )
 from cuspid.motion.frontend.pairs import IndexedFeatures, MatchingOptions, frame_pairs, index_features, match_guided
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.frontend.tracks import intersect_rays, join, points_across, thin
 from cuspid.runtime.errors import ReconstructionError
-from cuspid.runtime.image_files import visible_grey
 from cuspid.runtime.options import SEED, SHARE, Options, Range
 from cuspid.runtime.progress import Progress, silent
 from cuspid.runtime.workers import computed_once, map_in_threads
@@ -477,13 +477,14 @@ def locate(
     """
     options, log = options or MotionOptions(), dict[str, float]()
     require_stereo(capture.handpiece, options.pairing)
+    pictures = Pictures(capture) if options.least_squares.enabled else Pictures(capture, max_bytes=0)
     with _log_time(log, "features"):
-        features = detect_all(capture, options.sought, progress=progress, cache=cache)
+        features = detect_all(pictures, options.sought, progress=progress, cache=cache)
     names = [frame.name for frame in capture.frames]
     frames = {frame.name: frame for frame in capture.frames}
 
     def read(frame: str, camera: str) -> UInt8[np.ndarray, "h w"]:
-        return visible_grey(capture.fine_image(frames[frame], camera))
+        return pictures.grey(frames[frame], camera)
 
     found = locate_features(capture.handpiece, features, names, options, read=read, progress=progress)
     return replace(found, dropped=(*capture.left_out, *found.dropped), log={**log, **found.log})

@@ -153,7 +153,7 @@ def reconstruct(
 
     Raises ReconstructionError where too few frames can be located, or no surface is left.
     """
-    folder, capture = Path(folder), capture.keep_images()
+    folder = Path(folder)
     options = replace(options, signal=resolve_signal(capture, options))
     found = find_poses(capture, folder, options, colmap_model=colmap_model, progress=progress)
     return found, surface(capture, found, folder, options, progress=progress)[0]
@@ -230,7 +230,6 @@ def surface(
     """The mesh, given the poses of the frames (second part of :func:`reconstruct`), and how well each of its vertices
     is known: standard deviation along the normal, um."""
     trim_heap()
-    forget_images = capture.forget_images
     options, capture = resolve_options(options), unroll_capture(capture, found)
     of_size = resize_for_quality(replace(capture, handpiece=replace(capture.handpiece, rig=found.rig)), options)
     detail = detail_mm(of_size.handpiece)
@@ -238,7 +237,6 @@ def surface(
         depths = _shaded_depth(capture, folder, options, progress)
     else:
         depths = _textured_depth(of_size, found, detail, folder, options, progress)
-    forget_images()
     trim_heap()
     return fuse(
         depths,

@@ -30,6 +30,7 @@ from cuspid.model.pairing import detail_mm, require_stereo
 from cuspid.model.reconstruction import DepthMap, Reconstruction
 from cuspid.model.rig import Handpiece
 from cuspid.motion.frontend.features import Features, detect_all
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.motion.tracker import Placed, Tracker
 from cuspid.mvs.matching import DepthEstimator
 from cuspid.mvs.signal import shows_detail
@@ -176,7 +177,7 @@ class Session:
     def _features(self, frame: Frame) -> Mapping[tuple[str, str], Features]:
         one = replace(self._capture, frames=(frame,))
         cache = self._folder / "motion" / "cache"
-        return detect_all(one, self._settled.tracking.sought, cache=cache)
+        return detect_all(Pictures(one, max_bytes=0), self._settled.tracking.sought, cache=cache)
 
     def _find_again(self, name: str) -> Mapping[tuple[str, str], Features]:
         return self._features(next(frame for frame in self.frames if frame.name == name))

@@ -18,7 +18,8 @@ from jaxtyping import Float, Int, UInt8
 
 from cuspid.geometry import distinct_rows
 from cuspid.model.camera import OPENCV_PIXEL_OFFSET, Camera
-from cuspid.model.capture import Capture, Frame, halved_size
+from cuspid.model.capture import Frame, halved_size
+from cuspid.motion.frontend.pictures import Pictures
 from cuspid.runtime.image_files import Pixels, as_8_bits, brighten
 from cuspid.runtime.options import Options, Range
 from cuspid.runtime.progress import Progress, silent
@@ -161,27 +162,29 @@ def _mask_outside_model(mask: UInt8[np.ndarray, "h w"] | None, lens: Camera) -> 
     return np.where(lens.valid_mask, whole, np.uint8(0))
 
 
-def _detect_kept(capture: Capture, frame: Frame, camera: str, options: FeatureOptions, stage: Stage | None) -> Features:
+def _detect_kept(
+    pictures: Pictures, frame: Frame, camera: str, options: FeatureOptions, stage: Stage | None
+) -> Features:
     """Features of one image of a capture, from the results of an earlier run where they are there."""
-    lens = capture.handpiece.rig[camera].camera
-    mask = _mask_outside_model(capture.source.mask(frame.name, camera), lens)
+    lens = pictures.capture.handpiece.rig[camera].camera
+    mask = _mask_outside_model(pictures.capture.source.mask(frame.name, camera), lens)
     if stage is None:
-        return detect(capture.fine_image(frame, camera), options, mask)
+        return detect(pictures.image(frame, camera), options, mask)
     path = stage.folder / camera / f"{frame.name}.npz"
-    made_from = {"image": capture.source.digest(frame.name, camera)}
+    made_from = {"image": pictures.capture.source.digest(frame.name, camera)}
     if lens.valid_mask is not None:
         made_from["lens"] = digest_of([lens.model, lens.parameters])
     key = stage.key(made_from)
     if stage.has(key, [path]):
         return _load(path)
-    features = detect(capture.fine_image(frame, camera), options, mask)
+    features = detect(pictures.image(frame, camera), options, mask)
     write_arrays(path, {name: getattr(features, name) for name in ("pixels", "descriptors", "colors")})
     stage.record(key, [path])
     return features
 
 
 def detect_all(
-    capture: Capture,
+    pictures: Pictures,
     options: FeatureOptions | None = None,
     *,
     progress: Progress = silent,
@@ -191,10 +194,10 @@ def detect_all(
     InputError."""
     options = options or FeatureOptions()
     stage = None if cache is None else Stage("features", cache / "features", options, (__name__,))
-    images = [(frame, camera) for frame in capture.frames for camera in frame.cameras]
+    images = [(frame, camera) for frame in pictures.capture.frames for camera in frame.cameras]
 
     def detect_kept(image: tuple[Frame, str]) -> Features:
-        return _detect_kept(capture, *image, options, stage)
+        return _detect_kept(pictures, *image, options, stage)
 
     found = map_in_threads(detect_kept, images, stage="features", progress=progress)
     return {(frame.name, camera): features for (frame, camera), features in zip(images, found, strict=True)}
