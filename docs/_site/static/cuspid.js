@@ -1,7 +1,14 @@
-// Tables, formulas and code that are wider than the page are moved by the keys; headings of the contents have their level.
+// Tables, formulas and code that are wider than the page are moved by the keys; headings of the contents have their level;
+// the two sidebars have names of their own, and a table's empty corner is no heading.
 "use strict";
 addEventListener("DOMContentLoaded", () => {
   for (const caption of document.querySelectorAll(".caption[role=heading]")) caption.ariaLevel = "2";
+  for (const [place, name] of [[".sidebar-drawer", "All pages"], [".toc-drawer", "This page"]]) {
+    document.querySelector(place)?.setAttribute("aria-label", name);
+  }
+  for (const cell of document.querySelectorAll("th")) {
+    if (!cell.textContent.trim()) cell.replaceWith(document.createElement("td"));
+  }
   const watch = new ResizeObserver((entries) => {
     for (const { target } of entries) {
       if (target.scrollWidth > target.clientWidth) target.tabIndex = 0;
