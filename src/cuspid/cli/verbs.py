@@ -112,6 +112,7 @@ LIMITS: Mapping[str, str] = dict.fromkeys(("minimum", "least", "fewest", "smalle
 )
 """What options that are limits began with in version 0.2, and with what they begin now."""
 RENAMED_OPTIONS: Mapping[str, str] = {
+    "photographs.largest-px": "photographs.max-image-px",
     "coarsest-mm": "max-pixel-mm",
     "worst-median-mm": "max-median-mm",
     "farthest-mm": "study.max-distance-mm",
