@@ -86,6 +86,16 @@ def test_shading_recovers_a_sphere_and_shows_nothing_beside_it() -> None:
     np.testing.assert_array_equal(found.normals[~found.known], np.broadcast_to([0, 0, -1], ((~found.known).sum(), 3)))
 
 
+def test_spheres_about_the_camera_are_as_far_as_their_light_tells() -> None:
+    """No slope is to be found, away from the gap between them: one iteration at each size is enough."""
+    light = np.zeros((120, 160), np.float32)
+    light[:, :90], light[:, 100:] = 1.0, np.exp(-1)
+    found = shape_of_light(light, light > 0, CAMERA, 1)
+    distance = np.log(found.depth / directions()[..., 2])
+    np.testing.assert_allclose(distance[:, :86], 0, atol=1e-3)
+    np.testing.assert_allclose(distance[:, 104:], 0.5, atol=1e-3)
+
+
 def test_brightness_only_scales_the_depth() -> None:
     distance, normals = plane([0.2, -0.1, -1.0])
     light = (-np.sum(normals * directions(), axis=-1) / distance**2).astype(np.float32)

@@ -10,10 +10,12 @@ from scipy.spatial.transform import Rotation
 from cuspid.anatomy.landmarks.dimensions import arch_dimensions, needed_landmarks
 from cuspid.anatomy.landmarks.estimation import SIGMA_MM, estimate_landmarks, with_estimates
 from cuspid.anatomy.landmarks.scheme import TOOTH_LANDMARKS, central_groove_u, labels_of, missing, tip_direction
+from cuspid.anatomy.landmarks.tooth_view import _view
 from cuspid.anatomy.phantom.build import build_phantom
 from cuspid.anatomy.phantom.options import PhantomOptions
 from cuspid.geometry import Rigid3
 from cuspid.model.jaw import ARCHES, GUM, Jaw, Landmark
+from cuspid.model.mesh import Mesh
 from cuspid.report.figures.landmark import save_landmark_picture, save_measure_picture
 from cuspid.runtime.errors import InputError
 
@@ -64,6 +66,22 @@ def test_the_uncertainties_cover_the_errors(phantom: Jaw):
     # They are those of real teeth, which err by more than a phantom's.
     assert 0.25 < np.sqrt(np.mean(scaled**2)) < 1.0
     assert np.mean(np.abs(scaled) < 2) > 0.95
+
+
+def test_heights_go_through_the_vertices_and_bend_between_them():
+    """On a dome of triangles, anywhere in the jaw, they are nearer to the dome than the triangles are."""
+    side, place = 11, np.array([20.0, -30.0, 5.0])
+    x, y = (each.ravel() for each in np.meshgrid(np.linspace(-4, 4, side), np.linspace(-4, 4, side), indexing="ij"))
+    dome = lambda u, v: -0.06 * (u**2 + v**2)  # noqa: E731
+    k = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    faces = np.vstack([np.column_stack(each) for each in ((k, k + side, k + side + 1), (k, k + side + 1, k + 1))])
+    view = _view(46, Mesh(np.column_stack([x, y, dome(x, y)]) + place, faces), np.eye(3), 0.1)
+    assert view is not None
+    inside = np.abs(view.places).max(axis=-1) < 2.5
+    error = (view.heights - dome(*np.moveaxis(view.places, -1, 0)))[inside]
+    sag = 0.06 * (8 / (side - 1)) ** 2 / 2
+    assert 0 < np.sqrt(np.mean(error**2)) < 0.2 * sag
+    np.testing.assert_allclose(view.lift(np.array([0.8, -1.6])), place + [0.8, -1.6, dome(0.8, -1.6)], atol=0.01)
 
 
 def test_tips_of_worn_cusps_are_their_outer_corners():

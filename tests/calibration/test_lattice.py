@@ -11,7 +11,7 @@ import pytest
 from boards import before_lens
 from cuspid.calibration.causes import cause_of_absence
 from cuspid.calibration.corners import find_corners
-from cuspid.calibration.lattice import find_lattice
+from cuspid.calibration.lattice import Lattice, Saddles, find_lattice, is_as_large
 from cuspid.geometry import Rigid3
 from cuspid.model.board import Board
 from cuspid.model.camera import Camera
@@ -74,6 +74,19 @@ def test_a_board_of_another_size_is_not_found_in_it_but_named(columns: int, rows
     told = cause_of_absence([image], said)
     assert told is not None
     assert "chessboard of 9 x 7 squares: give --columns 9 --rows 7" in told
+
+
+@pytest.mark.parametrize(("columns", "rows", "kept", "fits"), [(8, 6, 29, True), (8, 6, 28, False), (8, 5, 40, False)])
+def test_a_lattice_fits_a_board_by_its_size_and_with_enough_of_its_corners(
+    columns: int, rows: int, kept: int, fits: bool
+) -> None:
+    """60 % of 48; the first and the last reach from border to border."""
+    cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
+    cells = np.vstack([cells[-1:], cells[: kept - 1]])
+    both = np.zeros((kept, 2, 2))
+    lattice = Lattice(cells, Saddles(np.zeros((kept, 2)), both, both[:, 0]), np.zeros((1, 1), np.uint8))
+    assert lattice.size == (columns, rows)
+    assert is_as_large(lattice, BOARD) == fits
 
 
 def test_colours_tell_which_end_is_which() -> None:

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import re
+from contextlib import redirect_stdout
+from functools import cache
+from io import StringIO
 from pathlib import Path
 
 import pytest
 
 from cuspid import cli
 from cuspid.cli.config import options_of, read_config
+from cuspid.cli.verbs import DROPPED_OPTIONS, LIMITS, RENAMED, RENAMED_OPTIONS
+from documents import ROOT
 from verbs import refused, run
 
 VERBS = sorted(set(cli.COMMANDS) - {"reproduce"})
+OLD = [line.split(": ") for line in (ROOT / "tests/support/options-of-0.2.txt").read_text().splitlines()]
+"""Verbs of version 0.2, and options that they all had, as its parser told them; also of the kinds of ``prepare``."""
+NEGATED = re.compile(r"(?<![^.])no-")
 
 
-def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    with pytest.raises(SystemExit) as caught:
+@cache
+def help_of(*words: str) -> str:
+    printed = StringIO()
+    with pytest.raises(SystemExit) as caught, redirect_stdout(printed):
         run(*words)
     assert caught.value.code == 0
-    return capsys.readouterr().out
+    return printed.getvalue()
 
 
 def options_in(printed: str) -> list[str]:
@@ -26,8 +36,8 @@ def options_in(printed: str) -> list[str]:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_the_help_shows_what_people_need_and_all_of_it_on_demand(capsys: pytest.CaptureFixture[str], verb: str) -> None:
-    short, every = help_of(capsys, *verb.split(), "--help"), help_of(capsys, *verb.split(), "--help-all")
+def test_the_help_shows_what_people_need_and_all_of_it_on_demand(verb: str) -> None:
+    short, every = help_of(*verb.split(), "--help"), help_of(*verb.split(), "--help-all")
     few, many = set(options_in(short)) - {"help"}, set(options_in(every)) - {"help"}
     assert len(few) <= 25
     assert few <= many
@@ -102,6 +112,38 @@ def test_old_names_tell_the_new_ones(capsys: pytest.CaptureFixture[str], old: st
         run(old, "--out", "x")
     assert caught.value.code == 2
     assert f"{old} is now called {new}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("old", sorted({verb for verbs, _ in OLD for verb in verbs.split(", ")}))
+def test_an_option_of_version_02_is_taken_or_tells_its_successor(capsys: pytest.CaptureFixture[str], old: str) -> None:
+    """As far as the real parser's own help lists what it takes."""
+    verb, *kind = old.split()
+    words = [*RENAMED.get(verb, verb).split(), *kind]
+    taken = {re.sub(NEGATED, "", name) for name in options_in(help_of(*words, "--help-all"))}
+    had = [name for verbs, names in OLD if old in verbs.split(", ") for name in names.split()]
+    assert len(had) == len(set(had)) > 0
+    for name in had:
+        if re.sub(NEGATED, "", name) not in taken:
+            said = refused(capsys, *words, f"--{name}=3", alone=True)
+            told = re.fullmatch(rf"cuspid: [a-z ]+: --{name} is now called --([\w.-]+)", said)
+            dropped = f"--{name} of version 0.2 was dropped: "
+            assert re.sub(NEGATED, "", told[1]) in taken if told else dropped in said, said
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_no_option_has_a_name_of_version_02(verb: str) -> None:
+    parts = "|".join(map(re.escape, [*RENAMED_OPTIONS, *DROPPED_OPTIONS]))
+    old = re.compile(rf"(^|\.)(({'|'.join(LIMITS)})-[\w-]*$|({parts})(\.|$))")
+    assert not [name for name in options_of(cli.COMMANDS[verb]) if old.search(name)]
+
+
+def test_the_page_on_version_02_tells_the_successors_of_options() -> None:
+    page = (ROOT / "docs/from-0.2.md").read_text()
+    rows = re.findall(r"^\| `(?:[a-z ]+ )?--([\w.-]+?)(?:\.…)?` \| (.+?) \|$", page, re.MULTILINE)
+    expected = {old: f"--{new}" for old, new in RENAMED_OPTIONS.items()}
+    expected |= {old: f"dropped: {instead}" for old, instead in DROPPED_OPTIONS.items()}
+    assert {old: re.sub(r"`|\.….*", "", said) for old, said in rows} == expected
+    assert all(f"`{old}-`" in page for old in LIMITS)
 
 
 def test_a_group_lists_its_verbs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,11 +11,12 @@ import pytest
 
 from builders import box_mesh, handpiece, image_path, make_capture, shifted, sphere
 from cuspid import __version__, cli, storage
-from cuspid.cli.scan import _evaluate_trajectory
+from cuspid.cli.scan import _evaluate_trajectory, reconstruct_capture
 from cuspid.cli.shared import Probe, load_probe, suit_lights
 from cuspid.geometry import Rigid3
 from cuspid.model.mesh import Mesh
-from cuspid.runtime.errors import InputError
+from cuspid.pipeline.scan import ReconstructionOptions
+from cuspid.runtime.errors import InputError, ReconstructionError
 from report_folders import known_trueness
 from verbs import refused, run
 
@@ -102,6 +103,20 @@ def test_images_of_a_wrong_size(tmp_path, capsys):
     storage.write_image(image_path(capture, "00000", "a"), np.zeros((9, 9, 3), dtype=np.uint8))
     message = refused(capsys, "reconstruct", tmp_path / "capture", "--out", tmp_path / "scan")
     assert "9 x 9 px, but camera a has 16 x 12 px" in message
+
+
+@pytest.mark.parametrize(("stems", "told"), [(("0",), False), (("0", "1"), True)])
+def test_what_is_assumed_of_a_calibration_is_told_where_it_is_refined(tmp_path, capsys, monkeypatch, stems, told):
+    """Two frames are enough for that, one is not."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise ReconstructionError("nothing located")
+
+    monkeypatch.setattr("cuspid.pipeline.scan.find_poses", fail)
+    capture = make_capture(tmp_path / "capture", stems=stems)
+    with pytest.raises(ReconstructionError, match="nothing located"):
+        reconstruct_capture(capture, tmp_path / "scan", ReconstructionOptions(signal="texture"))
+    assert ("taken as nominal" in " ".join(capsys.readouterr().err.split())) == told
 
 
 def test_a_handpiece_with_an_unknown_camera(tmp_path, capsys):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from cuspid import storage
-from cuspid.evaluation.margin import MarginOptions, cut_margin, cut_margins, margin_error
+from cuspid.evaluation.margin import MarginOptions, _edge, cut_margin, cut_margins, margin_error
 from cuspid.geometry import Rigid3
 from cuspid.model.jaw import Jaw
 from cuspid.model.mesh import Mesh
@@ -82,6 +82,20 @@ def test_a_rounded_edge_lies_inwards(fillet_mm: float) -> None:
     assert found.outward_um == pytest.approx(-expected_um, abs=4)
     assert found.lateral_um == pytest.approx(0, abs=4)
     assert found.found_pct > 98
+
+
+@pytest.mark.parametrize(("far_deg", "found"), [(100.0, "far"), (62.5, "near")])
+def test_a_sharper_edge_may_lie_farther_away(far_deg: float, found: str) -> None:
+    """One and a half standard deviations (a quarter of the reach) away, one 3.1 times as sharp is as likely."""
+    options = MarginOptions(reach_mm=2.4, min_bend_deg=15.0)
+    bends = np.deg2rad([0.0, 25.0, far_deg])
+    steps = np.array([2.0, 0.9, 1.0])
+    ways = np.column_stack([np.cos(np.cumsum(-bends)), np.sin(np.cumsum(-bends))]) * steps[:, None]
+    places = np.vstack([[0.0, 0.0], np.cumsum(ways, axis=0)]) - ways[0]
+    edge = _edge(places, options)
+    assert edge is not None
+    expected = places[1] if found == "near" else places[2]
+    assert np.linalg.norm(edge.point - expected) < 0.03
 
 
 def test_what_the_scan_lacks_is_not_found() -> None:

@@ -163,6 +163,39 @@ def test_covariance_factor_squares_to_the_covariance(rank: int, seed: int) -> No
     np.testing.assert_allclose(factor @ factor.T, root @ root.T, atol=1e-12)
 
 
+def test_eliminated_points_leave_the_schur_complement() -> None:
+    """Of the equations of all unknowns at once, H - W V^-1 W^T, with the residuals and derivatives of each pixel."""
+    state, observations, _ = disturbed_state(3, with_priors(make_rig()))
+    frames, width = len(state.frame_rotation), state.basis.shape[1]
+    size, points = 6 * (frames - 1) + state.whitened.size, len(state.points)
+    rows, residuals = (
+        np.zeros((len(observations.pixels), 2, size + 3 * points)),
+        np.zeros((len(observations.pixels), 2)),
+    )
+    for o, point in enumerate(np.repeat(np.arange(points), np.diff(observations.start))):
+        frame, camera = observations.frame[o], observations.camera[o]
+        pixel, jacobian = linearised(state, frame, camera, point)
+        at = 6 * (frames - 1) + width * camera
+        rows[o, :, size + 3 * point :][:, :3], rows[o, :, at : at + width] = jacobian[:, :3], jacobian[:, 9:]
+        if frame:
+            rows[o, :, 6 * (frame - 1) : 6 * frame] = jacobian[:, 3:9]
+        residuals[o] = pixel - observations.pixels[o]
+    prior = np.concatenate([np.zeros(6 * (frames - 1)), np.ones(state.whitened.size)])
+    whole = np.einsum("oki,okj->ij", rows, rows) / SIGMA_PX**2
+    side = np.einsum("oki,ok->i", rows, residuals) / SIGMA_PX**2
+    whole[range(size), range(size)] += prior
+    side[:size] += prior * np.concatenate([np.zeros(6 * (frames - 1)), state.whitened.ravel()])
+    coupling, among = whole[:size, size:], whole[size:, size:]
+    schur = whole[:size, :size] - coupling @ np.linalg.solve(among, coupling.T)
+    found = normal_equations.normal_equations(
+        state, observations, normal_equations.Weighting(SIGMA_PX, np.inf, calibrated=True)
+    )
+    np.testing.assert_allclose(np.tril(found.matrix), np.tril(schur), rtol=1e-6, atol=1e-8 * np.abs(schur).max())
+    reduced = side[:size] - coupling @ np.linalg.solve(among, side[size:])
+    np.testing.assert_allclose(found.gradient, reduced, rtol=1e-6, atol=1e-8 * np.abs(reduced).max())
+    np.testing.assert_allclose(found.diagonal, np.diag(whole)[:size], rtol=1e-9)
+
+
 # --- the gauge of a free calibration -----------------------------------------------------------------------------
 
 

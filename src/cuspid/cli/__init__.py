@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, get_type_hints
 
 from cuspid import __version__
-from cuspid.cli.verbs import GROUPS, VERBS, overview, reject_unknown, split_verb
+from cuspid.cli.verbs import GROUPS, VERBS, overview, reject_old_options, reject_unknown, split_verb
 from cuspid.runtime.errors import CuspidError
 from cuspid.runtime.plugins import load_plugin
 
@@ -164,12 +164,13 @@ codecs.register_error(_IN_OTHER_LETTERS, _describe_system_error)
 def _run_verb(verb: str, given: list[str]) -> None:
     import tyro
 
-    from cuspid.cli.config import read_config, take_target, write_config
+    from cuspid.cli.config import options_of, read_config, take_target, write_config
     from cuspid.cli.usage import show_help
 
     prog, command = f"cuspid {verb}", COMMANDS[verb]
     if {"-h", "--help", "--help-all"} & set(given):
         show_help(prog, command, given, every="--help-all" in given)
+    reject_old_options(verb, given, options_of(command))
     target, given = take_target(read_config(verb, command, given))
     if target is None:
         tyro.cli(check_options_of(verb), prog=prog, args=given)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Container, Mapping, Sequence
 from difflib import get_close_matches
 from types import MappingProxyType
 from typing import NamedTuple
 
 from cuspid import __version__
+from cuspid.runtime.errors import InputError
 
 
 class Verb(NamedTuple):
@@ -105,6 +107,26 @@ RENAMED: Mapping[str, str] = {"handpiece": "rig build", "stitch-eval": "pano eva
     name: f"{group} {name}" for group in GROUPS if group for name in GROUPS[group].verbs if name not in GROUPS[""].verbs
 }
 """Verbs of version 0.2 and those that took their places."""
+LIMITS: Mapping[str, str] = dict.fromkeys(("minimum", "least", "fewest", "smallest"), "min") | dict.fromkeys(
+    ("maximum", "most", "largest"), "max"
+)
+"""What options that are limits began with in version 0.2, and with what they begin now."""
+RENAMED_OPTIONS: Mapping[str, str] = {
+    "photographs.largest-px": "photographs.max-image-px",
+    "coarsest-mm": "max-pixel-mm",
+    "worst-median-mm": "max-median-mm",
+    "farthest-mm": "study.max-distance-mm",
+    "pair-samples": "study.samples",
+    "temporal.stereo": "stereo",
+    "temporal": "across",
+}
+"""Other options of version 0.2, or what stands before or between dots in their names, and what they are now."""
+DROPPED_OPTIONS: Mapping[str, str] = {
+    "temporal.least-baseline-share": "always 0.08",
+    "temporal.largest-turn-deg": "always 20",
+    "thesis": "fields of cuspid_thesis.stitching.method.ThesisOptions, in Python",
+}
+"""Options of version 0.2 that none took the place of, and what holds instead."""
 
 
 def split_verb(arguments: Sequence[str]) -> tuple[str, list[str]]:
@@ -139,3 +161,27 @@ def reject_unknown(name: str) -> str:
     near = get_close_matches(name, [*VERBS, *RENAMED], n=1)
     meant = f"did you mean {RENAMED.get(near[0], near[0])}? " if near else ""
     return f"there is no verb {name}; {meant}cuspid --help lists them"
+
+
+def reject_old_options(verb: str, given: Sequence[str], options: Container[str]) -> None:
+    """Raise InputError, which names the successor among the ``options`` of the verb, for the first option of version
+    0.2."""
+    for name in (word[2:].partition("=")[0].replace("_", "-") for word in given if word.startswith("--")):
+        for old, instead in DROPPED_OPTIONS.items():
+            if _part(old).search(name):
+                raise InputError(f"{verb}: --{name} of version 0.2 was dropped: {instead}")
+        now = _rename(name)
+        if now != name and re.sub(r"(^|\.)no-", r"\1", now) in options:
+            raise InputError(f"{verb}: --{name} is now called --{now}")
+
+
+def _rename(name: str) -> str:
+    """What an option of version 0.2 is called now."""
+    for old, new in RENAMED_OPTIONS.items():
+        name = _part(old).sub(rf"\1{new}", name)
+    return re.sub(rf"(^|\.)({'|'.join(LIMITS)})-(?=[\w-]*$)", lambda found: f"{found[1]}{LIMITS[found[2]]}-", name)
+
+
+def _part(of_name: str) -> re.Pattern[str]:
+    """A whole part of the dotted name of an option, with what comes before it."""
+    return re.compile(rf"(^(?:no-)?|\.){re.escape(of_name)}(?=\.|$)")

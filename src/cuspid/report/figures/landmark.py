@@ -154,4 +154,5 @@ def _draw_length(axes: Axes, name: str, ends: Float[np.ndarray, "2 3"], value_mm
         ha="center",
         va="center",
         bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9},
+        zorder=4,  # over the arrows of other lengths, too
     )
