@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -123,6 +122,7 @@ def measured(benchmark: Benchmark, work: Path, given: Mapping[str, Path]) -> boo
     own.mkdir(exist_ok=True)
     folder.mkdir(exist_ok=True)
     script, *options = benchmark.command.format(out=out, folder=folder, work=own, **given).split()
+    begin = time.monotonic()
     paths = os.pathsep.join(str(checkout / each) for each in ("src", "benchmarks"))
     with (work / f"{benchmark.name}.log").open("w") as log:
         status = subprocess.run(
@@ -135,7 +135,8 @@ def measured(benchmark: Benchmark, work: Path, given: Mapping[str, Path]) -> boo
         ).returncode
     if status or not out.exists():
         return False
-    shutil.copy(out, RESULTS)
+    result = {**json.loads(out.read_text()), "campaign_min": round((time.monotonic() - begin) / 60, 1)}
+    (RESULTS / out.name).write_text(json.dumps(result, indent=1) + "\n")
     return True
 
 

@@ -246,10 +246,13 @@ def commits_of(results: Mapping[str, Result]) -> list[str]:
     return sorted({str(result["commit"]) for result in results.values()})
 
 
-def measured_at(commits: list[str]) -> str:
-    """Whether benchmarks are of one commit, for people."""
+def measured_at(results: Mapping[str, Result]) -> str:
+    """Whether benchmarks are of one commit, and then how long they took, for people."""
+    commits = commits_of(results)
+    minutes = [result["campaign_min"] for result in results.values() if "campaign_min" in result]
     if len(commits) == 1:
-        return f"All of them were measured at commit {commits[0]}."
+        took = f", in {sum(minutes) / 60:.1f} h in all" if len(minutes) == len(results) else ""
+        return f"All of them were measured at commit {commits[0]}{took}."
     return (
         f"**They are of {len(commits)} commits**, until `python benchmarks/campaign.py --release` has measured all of "
         "them anew."
@@ -264,7 +267,7 @@ def benchmarks(results: Mapping[str, Result], older: Older) -> str:
         "",
         GENERATED,
         "",
-        f"{measured_at(commits_of(results))} {standing(results, older)} "
+        f"{measured_at(results)} {standing(results, older)} "
         "What answers a question once is among the [experiments](experiments.md).",
         "",
         "Conditions of the thesis: texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN in each "

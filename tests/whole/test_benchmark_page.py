@@ -199,10 +199,20 @@ def test_a_campaign_measures_what_no_longer_holds(freshness, repository, monkeyp
     assert "mouth: 0.0 min\n" in said
     assert "precision: 0.0 min, failed, see " in said
     assert "measure: left out, needs --jaws\n" in said
-    assert json.loads((results / "mouth.json").read_text()) == {"commit": commit_of(repository)}
+    assert json.loads((results / "mouth.json").read_text()) == {"commit": commit_of(repository), "campaign_min": 0.0}
     assert not (results / "precision.json").exists()
     campaign.main()
     assert "mouth: holds\n" in capsys.readouterr().out
+
+
+def test_a_page_of_one_commit_tells_how_long_it_took(freshness):
+    page = import_module("page")
+    results = {name: {"commit": "0123456789ab", "campaign_min": minutes} for name, minutes in (("a", 90), ("b", 12))}
+    assert page.measured_at(results) == "All of them were measured at commit 0123456789ab, in 1.7 h in all."
+    assert page.measured_at({**results, "c": {"commit": "0123456789ab"}}) == (
+        "All of them were measured at commit 0123456789ab."
+    )
+    assert "of 2 commits" in page.measured_at({**results, "c": {"commit": "ba9876543210"}})
 
 
 def test_a_release_is_measured_at_its_own_commit(freshness, repository, monkeypatch, capsys):
