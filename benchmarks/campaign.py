@@ -70,7 +70,7 @@ BENCHMARKS = (
     case("prepared-arch"),
     *(case(f"all-round-{tooth}") for tooth in (35, 36, 42, 45)),
     case("spheres"),
-    Benchmark("fuzz", "fuzz.py --out {out}"),
+    Benchmark("fuzz", "fuzz.py --processes 2 --out {out}"),
     Benchmark("kill", "kill.py --work {work} --out {out}"),
     Benchmark("large", "large.py --work {work} --out {out}"),
     Benchmark("mutation", "mutation.py --work {work} --out {out}"),
