@@ -172,11 +172,18 @@ def _control_derivatives(k, u, v, by_parameters, at):
 
 @kernel
 @no_type_check
+def _pixel(model, k, u, v):
+    """Pixel of a place of the ideal lens."""
+    xd, yd = distort(model, k, u, v)
+    return k[0] * xd + k[2], k[1] * yd + k[3]
+
+
+@kernel
+@no_type_check
 def project(model, k, x, y, z):
     """Pixel of a point in the camera frame; before a perspective camera z must be positive."""
     u, v = _ideal(model, x, y, z)
-    xd, yd = distort(model, k, u, v)
-    return k[0] * xd + k[2], k[1] * yd + k[3]
+    return _pixel(model, k, u, v)
 
 
 @kernel
@@ -188,7 +195,6 @@ def point_jacobian(model, k, x, y, z, by_point):
     """
     fx, fy = k[0], k[1]
     u, v = _ideal(model, x, y, z)
-    xd, yd = distort(model, k, u, v)
     xu, xv, yu, yv = _ideal_derivatives(model, k, u, v)
     if model <= _FULL_OPENCV:
         by_point[0, 0], by_point[0, 1] = fx * xu / z, fx * xv / z
@@ -210,7 +216,7 @@ def point_jacobian(model, k, x, y, z, by_point):
         by_point[1, 0], by_point[1, 1] = fy * (yu * ux + yv * uy), fy * (yu * uy + yv * vy)
         by_point[0, 2] = -fx * (xu * x + xv * y) / away2
         by_point[1, 2] = -fy * (yu * x + yv * y) / away2
-    return fx * xd + k[2], fy * yd + k[3]
+    return _pixel(model, k, u, v)
 
 
 @kernel
@@ -259,7 +265,7 @@ def _project_points(model, k, limit, points, out):
             continue
         u, v = _ideal(model, x, y, z)
         if u * u + v * v <= limit * limit:
-            out[n, 0], out[n, 1] = project(model, k, x, y, z)
+            out[n, 0], out[n, 1] = _pixel(model, k, u, v)
 
 
 @kernel
