@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
+BASE   := $(VENV)/.base
 STAMP  := $(VENV)/.installed
 BPY    := build/blender
 
@@ -10,7 +11,8 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-all lint format docs benchmarks blender clean
 
-demo: $(STAMP)
+# Without what only the tests need: that would be half of all that is installed.
+demo: $(BASE)
 	$(BIN)/cuspid run --tooth 46 --out demo
 
 # Three workers for two cores: those that wait for processes and disks would leave a fifth of the time unused. One BLAS
@@ -52,10 +54,14 @@ $(BPY)/.installed: constraints-blender.txt
 	$(BPY)/bin/python -c 'import bpy'
 	touch $@
 
-$(STAMP): pyproject.toml reproduction/pyproject.toml constraints.txt
+$(BASE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "cuspid needs Python 3.11 or newer; name one with: make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	touch $(BASE)
+
+$(STAMP): $(BASE) reproduction/pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]' --editable reproduction
 	touch $(STAMP)
 
