@@ -59,7 +59,6 @@ def prepare(work: Path) -> None:
     camera = ("--camera.width-px", "320", "--camera.height-px", "240")
     cuspid(
         "pano",
-        "pano",
         "film",
         jaw,
         *camera,

@@ -18,6 +18,7 @@ import pytest
 
 from cuspid import cli, storage
 from cuspid.model.pairing import stereo_pairs
+from cuspid_thesis.scan_cases import scan_cases
 from documents import ROOT, Block, blocks, commands, mentions, pages, words
 
 RUN = ["tutorial.md", *(f"how-to/{path.name}" for path in sorted((ROOT / "docs/how-to").glob("*.md")))]
@@ -88,6 +89,29 @@ def test_every_command_of_version_02_works_or_tells_its_successor(parsed, capsys
             assert refused([*successor.split(), *arguments[1:]], capsys) is None, answer
     assert len(parsed) == len(verbs) > 30
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for program, target, *_ in given if program == "make")
+
+
+def commands_of_benchmarks(monkeypatch, folder: Path) -> list[list[str]]:
+    """Those of the scans that are measured, and of the runs that are killed."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    kill, made = importlib.import_module("kill"), []
+    monkeypatch.setattr(kill, "cuspid", lambda *arguments: made.append(list(arguments)))
+    kill.prepare(folder)
+    killed = [[*arguments, "--out", "out"] for arguments in kill.verbs(folder).values()]
+    scanned = [
+        arguments
+        for case in scan_cases(Path("jaw.ply")).values()
+        for arguments in ([*case.make, "--out", "jaw.ply"], ["simulate", *case.simulate, "--out", "scan"])
+        if arguments[0] != "--out"
+    ]
+    return made + killed + scanned
+
+
+def test_the_parser_takes_every_command_of_the_benchmarks(parsed, capsys, monkeypatch, tmp_path):
+    found = commands_of_benchmarks(monkeypatch, tmp_path)
+    complaints = {" ".join(arguments): said for arguments in found if (said := refused(arguments, capsys)) is not None}
+    assert not complaints
+    assert len(parsed) == len(found) > 20
 
 
 @pytest.mark.parametrize("wrong", ["run --tooht 46 --out scan/", "scan --out scan/", "run --tooth six --out scan/"])

@@ -140,7 +140,7 @@ def scan_cases(jaw: Path | None = None) -> dict[str, ScanCase]:
     table["arch"] = ScanCase(simulate=ONE_PASS)
     if jaw is not None:
         table["real-arch"] = ScanCase(jaw=str(jaw.resolve()), simulate=ONE_PASS)
-    table["spheres"] = ScanCase(jaw="spheres.ply", make=("phantom", "--spheres"), simulate=ONE_PASS)
+    table["spheres"] = ScanCase(jaw="spheres.ply", make=("jaw", "phantom", "--spheres"), simulate=ONE_PASS)
     prepared = prepared_cases()
     return table | prepared | {f"all-round-{tooth}": _all_round(prepared[f"prepared-{tooth}"]) for tooth in WITH_MARGIN}
 
