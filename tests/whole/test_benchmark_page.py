@@ -167,7 +167,7 @@ def test_benchmarks_of_several_commits_are_refused_unless_asked_for(freshness, m
     (tmp_path / "benchmarks" / "results" / "kill.json").unlink()
     monkeypatch.setattr("sys.argv", ["page.py"])
     page.main()
-    assert "All of them were measured at commit 0123456789ab." in (tmp_path / "docs" / "benchmarks.md").read_text()
+    assert "All of them were measured at commit 0123456789ab" in (tmp_path / "docs" / "benchmarks.md").read_text()
 
 
 def test_a_campaign_measures_what_no_longer_holds(freshness, repository, monkeypatch, capsys):
