@@ -152,6 +152,18 @@ def test_pictures_are_written_whole(tmp_path: Path):
     save_deviation_picture(tmp_path / "nothing.png", scan, nothing, small)
 
 
+@pytest.mark.parametrize("suffix", [".pdf", ".png"])
+def test_the_same_figure_is_the_same_file_at_any_time(tmp_path: Path, monkeypatch, suffix: str):
+    """The run that a kill interrupted leaves what an undisturbed one does."""
+    for instant in (0, 2_000_000_000):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", str(instant))
+        figure = new_figure(2.0, 1.0, dpi=50)
+        figure.text(0.1, 0.5, "trueness / µm")
+        save_figure(figure, tmp_path / f"{instant}{suffix}")
+    first, second = (path.read_bytes() for path in sorted(tmp_path.iterdir()))
+    assert first == second
+
+
 def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="cannot be written"):

@@ -286,9 +286,9 @@ def new_figure(width_in: float, height_in: float, *, dpi: int, layout: Literal["
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all. Raises OutputError."""
+    """Write a figure, whole or not at all, and without the time: equal figures are equal bytes. Raises OutputError."""
     with whole_file(path) as temporary:
-        figure.savefig(temporary)
+        figure.savefig(temporary, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
 
 
 def _draw_title(figure: Figure, title: str) -> None:
