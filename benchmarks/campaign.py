@@ -1,4 +1,4 @@
-"""Measure anew what no longer holds, one benchmark after the other, all at one commit: the current one unless told.
+"""Measure anew what no longer holds, one benchmark after the other, at one commit: the current one unless told.
 
     python benchmarks/campaign.py [--release] [--commit C] [--list] [--only NAME ...] [--hours H] [--work FOLDER]
                                   [--jaws FOLDER] [--pairs FOLDER] [--ball FOLDER] [--photographs FOLDER]
@@ -6,12 +6,11 @@
 
 The commit is checked out into the work folder, so that work can go on meanwhile. Each result goes to
 benchmarks/results as soon as it is there; a campaign that was stopped goes on with what does not hold by then
-(:mod:`freshness`), and finished parts of most benchmarks are kept in the work folder. With ``--release`` it measures
-the benchmarks of a release, those that are not of this very commit; to go on with them after other commits, name
-theirs. Nothing is begun after ``--hours``. Scans of your own (``--jaws``), rectified photographs of two cameras
-(``--pairs``), photographs of a glossy ball (``--ball``), sets of real photographs (``--photographs``) and real views of
-boards (``--boards``) are not part of the project: without them, the benchmarks that need them are left out. Then make
-the page (``python benchmarks/page.py``). Pictures for the documentation stay in the work folder.
+(:mod:`freshness`), and finished parts of most benchmarks are kept in the work folder. ``--release`` leaves the
+experiments out. Nothing is begun after ``--hours``. Scans of your own (``--jaws``), rectified photographs of two
+cameras (``--pairs``), photographs of a glossy ball (``--ball``), sets of real photographs (``--photographs``) and real
+views of boards (``--boards``) are not part of the project: without them, the benchmarks that need them are left out.
+Then make the page (``python benchmarks/page.py``). Pictures for the documentation stay in the work folder.
 """
 
 from __future__ import annotations
@@ -48,13 +47,11 @@ class Benchmark:
         """Options that must be given, but were not."""
         return [f"--{what}" for what in GIVEN if f"{{{what}}}" in self.command and what not in given]
 
-    def holds(self, release: str | None) -> bool:
-        """Whether there is a result that holds: one of the commit of the release where there is one."""
+    @property
+    def holds(self) -> bool:
+        """Whether there is a result, and nothing that made it has changed."""
         file = RESULTS / f"{self.name}.json"
-        if not file.exists():
-            return False
-        result = json.loads(file.read_text())
-        return not changes(self.name, result) if release is None else release.startswith(result["commit"])
+        return file.exists() and not changes(self.name, json.loads(file.read_text()))
 
 
 def case(name: str, options: str = "") -> Benchmark:
@@ -161,14 +158,14 @@ def compile_all(work: Path) -> None:
         subprocess.run(command, env=environment, stdout=subprocess.DEVNULL, check=True)
 
 
-def asked_for(only: list[str] | None, release: str | None, given: Mapping[str, Path]) -> Iterator[Benchmark]:
+def asked_for(only: list[str] | None, given: Mapping[str, Path], *, release: bool) -> Iterator[Benchmark]:
     """What does not hold and can be measured; says what is left out."""
     for benchmark in BENCHMARKS:
         if only is not None and not any(fnmatch(benchmark.name, each) for each in only):
             continue
-        if release is not None and not maker_of(benchmark.name).release:
+        if release and not maker_of(benchmark.name).release:
             continue
-        if benchmark.holds(release):
+        if benchmark.holds:
             print(f"{benchmark.name}: holds")
         elif missing := benchmark.needs(given):
             print(f"{benchmark.name}: left out, needs {', '.join(missing)}")
@@ -179,7 +176,7 @@ def asked_for(only: list[str] | None, release: str | None, given: Mapping[str, P
 def main() -> None:
     """Measure, and say how it went."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--release", action="store_true", help="what is measured for each release, all at the commit")
+    parser.add_argument("--release", action="store_true", help="only what is measured for each release")
     parser.add_argument("--commit", default="HEAD")
     parser.add_argument("--list", action="store_true", help="say what would be measured, and end")
     parser.add_argument("--only", nargs="*", help="names of results; * and ? stand for any characters")
@@ -192,7 +189,7 @@ def main() -> None:
     named = ["git", "rev-parse", f"{arguments.commit}^{{commit}}"]
     commit = subprocess.run(named, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
     begin = time.monotonic()
-    wanted = list(asked_for(arguments.only, commit if arguments.release else None, given))
+    wanted = list(asked_for(arguments.only, given, release=arguments.release))
     if arguments.list:
         print("\n".join(f"{each.name}: would be measured" for each in wanted))
         return

@@ -46,7 +46,7 @@ class Maker:
     plain: bool = False
     """Whether surfaces without texture take part."""
     release: bool = False
-    """Whether it is measured anew for each release, together with the others of these, at one commit."""
+    """Whether it holds for the code of each release, and is measured anew where it does not."""
 
     @property
     def leaves_out(self) -> tuple[str, ...]:

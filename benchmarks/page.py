@@ -2,9 +2,9 @@
 
     python benchmarks/page.py [--older]
 
-The benchmarks are what is measured anew for each release, all at one commit (``python benchmarks/campaign.py
---release``). An experiment answers a question, and has a commit of its own. Results of older code, and benchmarks of
-several commits, are refused unless they are asked for.
+The benchmarks are what holds for the code of each release (``python benchmarks/campaign.py --release`` measures what
+does not). An experiment answers a question, and has a commit of its own. Results of older code are refused unless they
+are asked for.
 """
 
 from __future__ import annotations
@@ -247,21 +247,17 @@ def commits_of(results: Mapping[str, Result]) -> list[str]:
 
 
 def measured_at(results: Mapping[str, Result]) -> str:
-    """Whether benchmarks are of one commit, and then how long they took, for people."""
+    """The commits of benchmarks, and how long all of them took, for people."""
     commits = commits_of(results)
     minutes = [result["campaign_min"] for result in results.values() if "campaign_min" in result]
-    if len(commits) == 1:
-        took = f", in {sum(minutes) / 60:.1f} h in all" if len(minutes) == len(results) else ""
-        return f"All of them were measured at commit {commits[0]}{took}."
-    return (
-        f"**They are of {len(commits)} commits**, until `python benchmarks/campaign.py --release` has measured all of "
-        "them anew."
-    )
+    took = f", in {sum(minutes) / 60:.1f} h in all" if len(minutes) == len(results) else ""
+    return f"They were measured at commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}{took}."
 
 
 def benchmarks(results: Mapping[str, Result], older: Older) -> str:
     """The page of what is measured for each release."""
     scans = {name: result for name, result in results.items() if "images_to_mesh" in result}
+    images = [result["images"] for name, result in scans.items() if name.startswith("all-round")] or [0]
     parts = [
         "# Benchmarks",
         "",
@@ -271,9 +267,10 @@ def benchmarks(results: Mapping[str, Result], older: Older) -> str:
         "What answers a question once is among the [experiments](experiments.md).",
         "",
         "Conditions of the thesis: texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN in each "
-        "colour channel, 120 images for a tooth and 1200 or more for an arch. (`all-round`: 360 for a tooth, with the "
-        "further passes that `--passes auto` plans, from the true jaw, where two cameras would see little: as one who "
-        "looks at what is missing and scans it.) Trueness is measured from scan to reference, over the surface that at "
+        "colour channel, 120 images for a tooth and 1200 or more for an arch. "
+        f"(`all-round`: {min(images)}-{max(images)} for a tooth, with the further passes that `--passes auto` plans, "
+        "from the true jaw, where two cameras would see little: as one who looks at what is missing and scans it.) "
+        "Trueness is measured from scan to reference, over the surface that at "
         "least two cameras of one frame could see (rule: `cuspid.model.visibility`). Times are wall-clock seconds of "
         "`cuspid reconstruct` on 2 cores with numba's compiled code cached. Whole arches are scanned "
         "in one pass (`--passes turns`).",
@@ -340,18 +337,11 @@ def read(folder: Path) -> dict[str, Result]:
 def main() -> None:
     """Read the results, write the pages, unless results are refused."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--older", action="store_true", help="take results of older code and of several commits, and say so"
-    )
+    parser.add_argument("--older", action="store_true", help="take results of older code, and say so")
     arguments = parser.parse_args()
     results = read(HERE / "results")
     older = {name: changed for name, result in results.items() if (changed := changes(name, result))}
     release = {name: result for name, result in results.items() if maker_of(name).release}
-    if len(commits_of(release)) > 1 and not arguments.older:
-        lines = [f"{name}: {result['commit']}" for name, result in release.items()]
-        raise SystemExit(
-            "\n".join([*lines, "benchmarks of several commits: run python benchmarks/campaign.py --release"])
-        )
     if older and not arguments.older:
         lines = [f"{name}: {first_few(changed)}" for name, changed in older.items()]
         raise SystemExit(
