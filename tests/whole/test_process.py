@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from verbs import refused
+from verbs import refused, run
 
 CUSPID = (sys.executable, "-m", "cuspid")
 
@@ -36,6 +36,30 @@ def test_it_ends_at_once_and_without_a_trace_of_where_it_was(tmp_path: Path, how
         begun.kill()
     assert begun.returncode in (-how, 130)
     assert not any(word in said for word in ("Traceback", "***", "@     0x", 'File "'))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_run_that_was_killed_while_it_rendered_goes_on_at_once(
+    tmp_path: Path, phantom_file: Path, how: signal.Signals
+) -> None:
+    """The processes that rendered for it end with it, and leave the folder to the next."""
+    run("rig", "build", "--design", "four", "--width-px", 160, "--height-px", 160, "--out", tmp_path / "probe")
+    scan = ("--handpiece", tmp_path / "probe" / "handpiece.json", "--tooth", "46", "--frames", "30")
+    command = [*CUSPID, "simulate", phantom_file, *scan, "--out", tmp_path / "scan"]
+    begun = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    while begun.poll() is None and not any(tmp_path.glob("scan/capture/images/*/*.png")):
+        time.sleep(0.02)
+    begun.send_signal(how)
+    assert begun.wait(60) != 0
+    again = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert again.returncode == 0, again.stderr
+    assert len(list(tmp_path.glob("scan/capture/images/*/*.png"))) == 120
 
 
 @pytest.mark.long

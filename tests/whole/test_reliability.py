@@ -101,8 +101,9 @@ with storage.claimed_folder(Path(sys.argv[1]), "test", {"a": 1}, {}):
 """
 
 
-def test_two_runs_in_one_folder_do_not_mix(tmp_path: Path) -> None:
+def test_two_runs_in_one_folder_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if they are alike; when the first has ended the other may go on, and in one process stages follow."""
+    monkeypatch.setattr("cuspid.storage.files._PATIENCE_S", 0.1)
     out = tmp_path / "out"
     first = subprocess.Popen([sys.executable, "-c", WORKING, str(out)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert first.stdin is not None

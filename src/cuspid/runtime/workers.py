@@ -4,6 +4,7 @@ share."""
 from __future__ import annotations
 
 import io
+import multiprocessing
 import os
 import pickle
 import sys
@@ -13,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
 from functools import cached_property
 from itertools import islice, pairwise
-from threading import RLock
+from threading import RLock, Thread
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -129,6 +130,17 @@ def map_slices(
     bounds = np.linspace(0, count, (parts or usable_cores()) + 1).astype(int)
     slices = [slice(*ends) for ends in pairwise(bounds.tolist())]
     return [work(each) for each in slices] if count < few or len(slices) == 1 else map_in_threads(work, slices)
+
+
+def end_with_parent() -> None:
+    """From now on, end this process as soon as the one that began it has ended: if it is killed, it cannot tell."""
+
+    def watch(parent: multiprocessing.process.BaseProcess) -> None:
+        parent.join()
+        os._exit(1)
+
+    if (parent := multiprocessing.parent_process()) is not None:
+        Thread(target=watch, args=(parent,), daemon=True).start()
 
 
 def pickle_fields(value: object) -> bytes:

@@ -555,6 +555,7 @@ _worker: _Worker
 
 def _adopt(worker: _Worker | bytes) -> None:
     global _worker
+    workers.end_with_parent()
     _worker = pickle.loads(worker) if isinstance(worker, bytes) else worker
 
 

@@ -11,6 +11,7 @@ import math
 import os
 import tempfile
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -316,6 +317,10 @@ _holding = threading.Lock()
 """The folders in which this process works, and how often it has claimed each."""
 
 
+_PATIENCE_S = 2.0
+"""How long a run waits for a folder: the processes of one that was killed end with what they had begun."""
+
+
 @contextmanager
 def _lock_folder(folder: Path) -> Iterator[None]:
     """No other process works in a folder in the block, which is made if need be. Raises OutputError where one does.
@@ -349,14 +354,20 @@ def _lock(folder: Path, stack: ExitStack) -> None:
     except (ImportError, OSError):
         return
     stack.callback(os.close, descriptor)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise OutputError(
-            f"{folder}: another run of cuspid works there; wait until it has ended, or give another --out"
-        ) from error
-    except OSError:  # a file system without locks
-        return
+    patient_until = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            if time.monotonic() > patient_until:
+                raise OutputError(
+                    f"{folder}: another run of cuspid works there; wait until it has ended, or give another --out"
+                ) from error
+            time.sleep(0.05)
+        except OSError:  # a file system without locks
+            return
+        else:
+            return
 
 
 def _first_difference(old: Any, new: Any, name: str = "") -> str:

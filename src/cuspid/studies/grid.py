@@ -25,7 +25,7 @@ from typing import Any
 from cuspid import storage
 from cuspid.runtime.errors import CuspidError, InputError, MissingDependencyError
 from cuspid.runtime.progress import Progress, silent
-from cuspid.runtime.workers import core_numbers, keep_to_core, usable_cores
+from cuspid.runtime.workers import core_numbers, end_with_parent, keep_to_core, usable_cores
 
 Value = float | int | str | bool | None
 """What a cell of the table holds."""
@@ -208,21 +208,13 @@ def _start(case: Case, work: Work, core: int) -> _Running:
 
 
 def _work_alone(sending: Connection, work: Work, case: Case, core: int) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     keep_to_core(core)
     sending.send(_attempt(work, case))
     sending.close()
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)  # With the watching thread alive, libraries complain of leaks while Python ends.
-
-
-def _end_with_parent() -> None:
-    """A study that is killed cannot tell its processes: each watches for itself."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _collect(finished: _Running) -> Outcome:
