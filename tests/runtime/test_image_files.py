@@ -56,6 +56,19 @@ def test_a_truncated_png_is_told_whatever_its_name(tmp_path: Path) -> None:
         image_size(tmp_path / "0.jpg")
 
 
+def test_a_deep_png_with_a_wrong_checksum_is_told_and_nothing_besides(tmp_path: Path, capfd) -> None:
+    """Pillow reads it, and with 8 of its bits; libpng complains to the terminal."""
+    path = tmp_path / "0.png"
+    cv2.imwrite(str(path), COLOURS.astype(np.uint16) << 8)
+    data = bytearray(path.read_bytes())
+    end_of_pixels = data.rindex(b"IEND") - 4
+    data[end_of_pixels - 1] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"0\.png: cannot be decoded \(wrong checksums\); copy the image again"):
+        read_image(path)
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 @pytest.mark.parametrize("image", [SHADES, COLOURS])
 @pytest.mark.parametrize("bits", [8, 10, 12, 16])

@@ -359,6 +359,7 @@ def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, in_place
     monkeypatch.setattr("cuspid.studies.scanners.study.measure_share", counted)
     prepare(tmp_path, out, QUICK, Intake())
     assert len(measured) == 2
+    assert not (out / "scans" / "left.json").exists()  # which would tell where it was interrupted
     prepare(tmp_path, out, QUICK, Intake())
     assert len(measured) == 2
     put(tmp_path, "A/m/2.stl", noisy(probe, rng))

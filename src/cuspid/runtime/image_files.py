@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import warnings
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -308,9 +309,12 @@ def _as_levels(path: Path, values: Shaped[np.ndarray, "h w"]) -> UInt16[np.ndarr
 
 
 def _bare_png(path: Path) -> bytes:
-    """A PNG with its pixels only: of anything else, libpng may complain to the terminal."""
+    """A PNG with its pixels only: of anything else, libpng may complain to the terminal. Raises ValueError for wrong
+    checksums, which Pillow passes over and libpng does not."""
     data = read_bytes(path, "image")
-    chunks = (data[at - 8 : at + length + 4] for kind, _, at, length in _chunks(io.BytesIO(data)) if kind in _PIXELS)
+    chunks = [data[at - 8 : at + length + 4] for kind, _, at, length in _chunks(io.BytesIO(data)) if kind in _PIXELS]
+    if any(zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big") for chunk in chunks):
+        raise ValueError("wrong checksums")
     return b"".join([_PNG_START, *chunks])
 
 

@@ -270,7 +270,6 @@ def _measure(
         }
         for scan in left
     }
-    storage.write_json(out / "scans" / "left.json", listed)
     cases = []
     for specimen in dict.fromkeys(scan.specimen for scan in left):
         of = [scan.key for scan in left if scan.specimen == specimen]
@@ -280,6 +279,7 @@ def _measure(
             (out / "shares" / "cases" / f"{name}.json").unlink(missing_ok=True)
             cases.append(Case(name=name, parameters={"keys": " ".join(share)}))
     if cases:
+        storage.write_json(out / "scans" / "left.json", listed)
         outcomes = run_grid(
             cases,
             partial(measure_share, out=out.resolve(), options=options),
@@ -289,6 +289,7 @@ def _measure(
             stage="scans",
             progress=progress,
         )
+        (out / "scans" / "left.json").unlink()
         for outcome in outcomes:
             for key in str(outcome.case.parameters["keys"]).split() if outcome.failure else ():
                 if not _is_done(out, key, keys[key][1], retry_failed=False):
