@@ -359,7 +359,7 @@ def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, in_place
     monkeypatch.setattr("cuspid.studies.scanners.study.measure_share", counted)
     prepare(tmp_path, out, QUICK, Intake())
     assert len(measured) == 2
-    assert not (out / "scans" / "left.json").exists()  # which would tell where it was interrupted
+    assert not (out / "shares").exists()  # which would tell where it was interrupted
     prepare(tmp_path, out, QUICK, Intake())
     assert len(measured) == 2
     put(tmp_path, "A/m/2.stl", noisy(probe, rng))
@@ -370,7 +370,7 @@ def test_what_is_kept_is_used_again_until_a_file_changes(tmp_path, jaw, in_place
     assert record["failure"] is None
     # A file that changes between its digest and its reading.
     listed = {changed.key: {**vars(changed), "path": str(changed.path), "digest": "another", "made_from": "x"}}
-    storage.write_json(out / "scans" / "left.json", listed)
+    storage.write_json(out / "shares" / "left.json", listed)
     measure_share(keys=changed.key, out=out, options=QUICK)
     assert "changed while" in storage.read_json(out / "scans" / f"{changed.key}.json")["failure"]
 

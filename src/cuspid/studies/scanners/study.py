@@ -6,6 +6,7 @@ contents of its file, its specimen and the options. It is measured again only wh
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -29,6 +30,8 @@ from cuspid.studies.scanners.summary import Compared, Group, Tables, coverage_re
 
 CODE = ("cuspid.studies.scanners.specimen", "cuspid.studies.scanners.scan")
 """What makes the results of a scan."""
+_WORK = "shares"
+"""Folder of what processes are told, while they measure."""
 _SHARE = 5
 """Scans that one process measures after another: to start it and to read the specimen takes as long as one of them."""
 
@@ -270,35 +273,35 @@ def _measure(
         }
         for scan in left
     }
+    shutil.rmtree(out / _WORK, ignore_errors=True)  # of a run that was killed
     cases = []
     for specimen in dict.fromkeys(scan.specimen for scan in left):
         of = [scan.key for scan in left if scan.specimen == specimen]
         for begin in range(0, len(of), _SHARE):
             share = of[begin : begin + _SHARE]
             name = storage.digest_of([listed[key]["made_from"] for key in share])[:16]
-            (out / "shares" / "cases" / f"{name}.json").unlink(missing_ok=True)
             cases.append(Case(name=name, parameters={"keys": " ".join(share)}))
     if cases:
-        storage.write_json(out / "scans" / "left.json", listed)
+        storage.write_json(out / _WORK / "left.json", listed)
         outcomes = run_grid(
             cases,
             partial(measure_share, out=out.resolve(), options=options),
-            out / "shares",
+            out / _WORK,
             workers=workers,
             cluster=cluster,
             stage="scans",
             progress=progress,
         )
-        (out / "scans" / "left.json").unlink()
         for outcome in outcomes:
             for key in str(outcome.case.parameters["keys"]).split() if outcome.failure else ():
                 if not _is_done(out, key, keys[key][1], retry_failed=False):
                     _fail(out, key, keys[key][1], outcome.failure or "")
+        shutil.rmtree(out / _WORK, ignore_errors=True)
 
 
 def measure_share(*, keys: str, out: Path, options: StudyOptions) -> dict[str, Value]:
-    """Measure some scans of one specimen, listed in ``scans/left.json``; each that fails says why in its record."""
-    listed = storage.read_json(out / "scans" / "left.json")
+    """Measure some scans of one specimen, listed in ``shares/left.json``; each that fails says why in its record."""
+    listed = storage.read_json(out / _WORK / "left.json")
     specimen = specimen_of(out, listed[keys.split()[0]]["specimen"])
     failed = 0
     for key in keys.split():
