@@ -24,6 +24,7 @@ from typing import Any
 
 from run import conditions
 
+from cuspid.runtime.workers import end_with_parent
 from cuspid.storage import read_json, write_json
 
 HERE = Path(__file__).parent
@@ -89,7 +90,7 @@ def main() -> None:
     chosen = turns(names, arguments.cases, arguments.first)
     shares = [chosen[k :: arguments.processes] for k in range(arguments.processes)]
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(arguments.processes, mp_context=spawn) as pool:  # whose workers may have workers
+    with ProcessPoolExecutor(arguments.processes, spawn, end_with_parent) as pool:  # workers may have workers
         parts = list(pool.map(run_turns, shares))
     ran = {"seeds": [[arguments.first, chosen[-1][1]]], **conditions()}
     found = together([{**ran, **part} for part in parts]) | {"seeds": ran["seeds"]}
