@@ -257,7 +257,8 @@ def measured_at(results: Mapping[str, Result]) -> str:
 def benchmarks(results: Mapping[str, Result], older: Older) -> str:
     """The page of what is measured for each release."""
     scans = {name: result for name, result in results.items() if "images_to_mesh" in result}
-    images = [result["images"] for name, result in scans.items() if name.startswith("all-round")] or [0]
+    images = [result["images"] for name, result in scans.items() if name.startswith("all-round")]
+    many = f"{min(images)}-{max(images)}" if images else "more"
     parts = [
         "# Benchmarks",
         "",
@@ -268,7 +269,7 @@ def benchmarks(results: Mapping[str, Result], older: Older) -> str:
         "",
         "Conditions of the thesis: texture `artificial`, twelve cameras with exact calibration, noise 1.5 DN in each "
         "colour channel, 120 images for a tooth and 1200 or more for an arch. "
-        f"(`all-round`: {min(images)}-{max(images)} for a tooth, with the further passes that `--passes auto` plans, "
+        f"(`all-round`: {many} for a tooth, with the further passes that `--passes auto` plans, "
         "from the true jaw, where two cameras would see little: as one who looks at what is missing and scans it.) "
         "Trueness is measured from scan to reference, over the surface that at "
         "least two cameras of one frame could see (rule: `cuspid.model.visibility`). Times are wall-clock seconds of "
